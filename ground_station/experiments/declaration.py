@@ -53,6 +53,13 @@ class FlightDeclaration:
         low=0,
         high=100,
     )
+    exposure_steps: str = config.key(
+        "", "T:EV, ...: from T seconds on exposures are off by EV from what auto exposure asks for"
+    )
+    light_steps: str = config.key("", "T:SHARE, ...: from T seconds on, this share of the light")
+    flicker: float = config.key(
+        0.0, "share by which the light swings, 100 times a second", low=0, high=1
+    )
     processing: str = config.key(
         "none", "what the camera makes of its sensor's light", choices=PROCESSINGS
     )

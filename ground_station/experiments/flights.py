@@ -9,14 +9,17 @@ from ground_station.simulator.simulate import SimulationSettings, simulate
 
 
 def stem(flight: FlightDeclaration, seed: int) -> str:
-    """How a simulated flight's recording is called: all that it depends on but the program."""
+    """How a simulated flight is called for who looks into the folder; a job's key tells the rest."""
     rate = f"-{flight.bitrate_kbps}kbps" if flight.bitrate_kbps else ""
     air = "" if flight.draught_m_s is None else f"-{flight.draught_m_s:g}ms"
     crowd = f"-{flight.people}people" if flight.people else ""
     processed = "" if flight.processing == "none" else f"-{flight.processing}-processing"
+    stepped = "-stepped" if flight.exposure_steps or flight.light_steps else ""
+    lamps = f"-{flight.flicker:g}flicker" if flight.flicker else ""
     return (
         f"{flight.scene}-{flight.plan}-{flight.light}-{seed}"
-        f"-{flight.duration_s:g}s-{flight.rate_hz:g}Hz{rate}{air}{crowd}{processed}"
+        f"-{flight.duration_s:g}s-{flight.rate_hz:g}Hz{rate}{air}{crowd}{stepped}{lamps}"
+        f"{processed}"
     )
 
 
@@ -38,6 +41,9 @@ def fly(flight: FlightDeclaration, seed: int, path: Path) -> None:
         bitrate_kbps=flight.bitrate_kbps or None,
         draught_m_s=flight.draught_m_s,
         people=flight.people,
+        exposure_steps=flight.exposure_steps,
+        light_steps=flight.light_steps,
+        flicker=flight.flicker,
         processing=flight.processing,
         points=points_of(path) if flight.clicked else None,
     )

@@ -29,9 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="atrium",
         help="atrium, office, corridor, hall (repeating panels), hall-glazed (a wall of dark"
         " glass), hall-above (the floor above: panels at the same places), hall-above-alike (of"
-        " the same prints), rooms (a flat), board (a calibration board), interior-1 to interior-999"
-        " (by chance: odd halls, even offices), atrium-moved (other furniture; -25 and -50: a"
-        " quarter, half of it moved),"
+        " the same prints), rooms (a flat), board (a calibration board), and by chance, 1 to 999:"
+        " interior-N (odd halls, even offices), passage-N, stairwell-N;"
+        " atrium-moved (other furniture; -25 and -50: a quarter, half of it moved),"
         " atrium-moved-posted (and other posters) (default: atrium)",
     )
     add(

@@ -14,7 +14,7 @@ import numpy as np
 
 from ground_station.arrays import F64
 from ground_station.simulator.building import OPEN, SceneBuilder
-from ground_station.simulator.scene import Scene, SimulatorError, Surface
+from ground_station.simulator.scene import Footprint, Scene, SimulatorError, Surface
 
 Rng = np.random.Generator
 
@@ -26,6 +26,8 @@ class _Room:
     FLOORS: tuple[str, ...] = ("terrazzo", "wood", "concrete")
     SOLIDS: tuple[str, ...] = ("wood", "metal", "fabric", "concrete", "plaster", "foliage")
     ABOVE = "concrete"
+    GLAZED = 0.5
+    """Of the walls: windows in most of their bays."""
     OUTSIDE = 0.4
     """Detail of the hedges, which are seen from afar."""
 
@@ -70,7 +72,7 @@ class _Room:
         corners = ((0, 0, length), (length, 0, width), (length, width, length), (0, width, width))
         ways = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
         for (x, y, run), (ux, uy) in zip(corners, ways, strict=True):
-            glazed = self.rng.random() < 0.5
+            glazed = self.rng.random() < self.GLAZED
             for start, wide in _pieces(run, self.bay):
                 # Fronts look into the room: u runs the other way round.
                 origin = np.array([x + ux * (start + wide), y + uy * (start + wide), 0.0])
@@ -171,31 +173,35 @@ def _pieces(length: float, step: float) -> list[tuple[float, float]]:
 
 
 class _Interior(_Room):
-    """A hall or, of an even number, an office, with prints of a few plates and a free way round."""
+    """What localizers are judged in, with prints of a few plates and a free way round."""
 
     WALLS = ("tiles", "wallpaper", "laminate", "laminate", "panelling")
     FLOORS = ("carpet", "tiles", "laminate")
     SOLIDS = ("laminate", "panelling", "carpet", "screen")
     ABOVE = "panelling"
     OUTSIDE = 0.25
+    SIZES_M: tuple[tuple[float, float, float], tuple[float, float, float]]
+    """The smallest and the largest: length, width, height."""
+    BLANK, DOORS_FROM = 0.25, 0.85
+    """Shares of the bays: below the first nothing hangs, above the second a door."""
+    TO_WALL_M = 1.9
+    """From the walls to the way round."""
 
-    def __init__(self, rng: Rng, texels_per_m: float, is_hall: bool) -> None:
-        self.is_hall = is_hall
+    def __init__(self, rng: Rng, texels_per_m: float) -> None:
         super().__init__(rng, texels_per_m)
         length, width, _ = self.size
-        self.ring = (length / 2 - _TO_WALL_M, width / 2 - _TO_WALL_M)
+        self.ring = (length / 2 - self.TO_WALL_M, width / 2 - self.TO_WALL_M)
 
     def _size(self) -> tuple[float, float, float]:
-        low, high = ((14, 11, 4.5), (22, 16, 8)) if self.is_hall else ((10, 8, 2.8), (14, 10, 3.4))
-        length, width, height = self.rng.uniform(low, high).tolist()
+        length, width, height = self.rng.uniform(*self.SIZES_M).tolist()
         return length, width, height
 
     def _hang(self, panel: Callable[..., Surface], wide: float, draw: float) -> None:
-        """A quarter of the bays is blank; half of what hangs is one of a few plates."""
+        """Nothing, an equal door, or prints, half of which are of one of a few plates."""
         height = self.size[2]
-        if draw < 0.25:
+        if draw < self.BLANK:
             return
-        if draw > 0.85 and wide > 1.5:
+        if draw > self.DOORS_FROM and wide > 1.5:
             self._survey(panel(0.3, 0, 0.95, 2.1, "door", text="EXIT", off=0.03, print=_PLATES,
                                detail=1.3))  # fmt: skip
             return
@@ -217,7 +223,7 @@ class _Interior(_Room):
 
     def things(self) -> None:
         """Furniture along the walls and in the middle; the way round stays free."""
-        length, width, height = self.size
+        length, width, _ = self.size
         a, b = (half - _FREE_M for half in self.ring)
         for _ in range(int(self.rng.integers(10, 25))):
             w, d = self.rng.uniform(0.4, 1.6), self.rng.uniform(0.3, 0.6)
@@ -231,28 +237,119 @@ class _Interior(_Room):
                     w, d = d, w
                     x, y = 0.4 + far * (length - 0.8), 0.9 + along * (width - 1.8)
             x, y = np.clip(x, w / 2 + 0.05, length - w / 2), np.clip(y, d / 2 + 0.05, width - d / 2)
-            low, high = (x - w / 2, y - d / 2, 0.0), (x + w / 2, y + d / 2)
-            top = float(self.rng.uniform(0.4, 1.5))
-            material = str(self.rng.choice(self.SOLIDS))
-            self.b.stand(low, (*high, top), material, faces=OPEN, rgb=self._rgb())
-        if self.is_hall:
-            for side in (-0.4, 0.4):
-                self.b.prism((length / 2 + side * a, width / 2), 0.25, (0, height), 8, "tiles",
-                             rgb=self._rgb())  # fmt: skip
+            self._stand(float(x), float(y), float(w), float(d), (0.4, 1.5))
+
+    def _stand(self, x: float, y: float, w: float, d: float, high_m: tuple[float, float]) -> None:
+        """A piece of furniture about a place, of a height by chance."""
+        top = float(self.rng.uniform(*high_m))
+        material = str(self.rng.choice(self.SOLIDS))
+        self.b.stand((x - w / 2, y - d / 2, 0.0), (x + w / 2, y + d / 2, top), material,
+                     faces=OPEN, rgb=self._rgb())  # fmt: skip
 
 
-_TO_WALL_M, _FREE_M = 1.9, 0.9
-"""From the walls to the way round; its half width."""
+class _Office(_Interior):
+    SIZES_M = (10, 8, 2.8), (14, 10, 3.4)
+
+
+class _Hall(_Interior):
+    SIZES_M = (14, 11, 4.5), (22, 16, 8)
+
+    def things(self) -> None:
+        super().things()
+        length, width, height = self.size
+        for side in (-0.4, 0.4):
+            x = length / 2 + side * (self.ring[0] - _FREE_M)
+            self.b.prism((x, width / 2), 0.25, (0, height), 8, "tiles", rgb=self._rgb())
+
+
+class _Passage(_Interior):
+    """A corridor between rooms: two bays of five are blank, more than one in five has a door."""
+
+    SIZES_M = (20, 2.6, 2.8), (32, 3.4, 3.2)
+    BLANK, DOORS_FROM, GLAZED = 0.4, 0.75, 0.2
+    TO_WALL_M = 0.9
+
+    def things(self) -> None:
+        """Cupboards and benches, flat against the walls."""
+        length, width, _ = self.size
+        for _ in range(int(self.rng.integers(3, 9))):
+            w, d = float(self.rng.uniform(0.5, 1.6)), float(self.rng.uniform(0.15, 0.3))
+            x = float(self.rng.uniform(1.0, length - 1.0))
+            y = 0.02 + d / 2 if self.rng.random() < 0.5 else width - 0.02 - d / 2
+            self._stand(x, y, w, d, (0.4, 1.9))
+
+
+class _Stairwell(_Interior):
+    """A well with stairs up two of its walls, galleries where they end, and equal steps."""
+
+    SIZES_M = (9, 7, 6.5), (12, 9, 9)
+
+    def things(self) -> None:
+        """Stairs along the south wall to half the height and on along the north one; railings."""
+        length, width, height = self.size
+        self._of = str(self.rng.choice(("tiles", "laminate", "carpet"))), self._rgb()
+        half = 0.45 * height
+        deep = width - 2 * _STAIR_M
+        self._flight(0.0, 1, 0.0, half)
+        self._gallery((length - _STAIR_M, 0.0), (length, width), half, deep)
+        self._flight(width - _STAIR_M, -1, half, 0.9 * height)
+        self._gallery((0.0, 0.0), (_STAIR_M, width), 0.9 * height, deep)
+        for _ in range(int(self.rng.integers(2, 6))):
+            x, y = self.rng.uniform(-0.3, 0.3, 2).tolist()
+            self._stand(length / 2 + x, width / 2 + y, 0.5, 0.4, (0.4, 1.1))
+
+    def _flight(self, y: float, way: int, low: float, high: float) -> None:
+        """Steps that rise along x, or against it, between the galleries at its ends."""
+        length = self.size[0]
+        count = max(3, round((high - low) / _RISE_M))
+        run = (length - 2 * _STAIR_M) / count
+        material, rgb = self._of
+        front = "-x" if way > 0 else "+x"
+        side = "+y" if y == 0 else "-y"
+        for k in range(count):
+            x = _STAIR_M + k * run if way > 0 else length - _STAIR_M - (k + 1) * run
+            top = low + (k + 1) * (high - low) / count
+            # The same plate for all steps, as one maker delivers them.
+            self.b.box([x, y, max(top - 0.3, 0.0)], [x + run, y + _STAIR_M, top], material,
+                       faces=("+z", front, side, "-z"), rgb=rgb, print=2 * _PLATES)  # fmt: skip
+        self.b.footprints.append(
+            Footprint((_STAIR_M, y, length - _STAIR_M, y + _STAIR_M), "stairs")
+        )
+
+    def _gallery(
+        self, low: tuple[float, float], high: tuple[float, float], top: float, deep: float
+    ) -> None:
+        """A slab across the well's end, and the railing on its inner edge."""
+        material, rgb = self._of
+        self.b.box([*low, top - 0.2], [*high, top], material, faces=("-x", "+x", "-z", "+z"),
+                   rgb=rgb)  # fmt: skip
+        inner = low[0] if low[0] > 0 else high[0] - 0.05
+        y = self.size[1] / 2 - deep / 2
+        for k in range(_POSTS):
+            at = y + (k + 0.5) * deep / _POSTS
+            self.b.box([inner, at - 0.02, top], [inner + 0.05, at + 0.02, top + 1.0], "metal",
+                       rgb=rgb, print=3 * _PLATES)  # fmt: skip
+        self.b.box([inner, y, top + 1.0], [inner + 0.05, y + deep, top + 1.06], "wood", rgb=rgb)
+        self.b.footprints.append(Footprint((*low, *high), "balcony"))
+
+
+_FREE_M = 0.9
+"""Half the width of a way round."""
 _PLATES = 4
-_HALLS_SEED = 90_001
+_STAIR_M, _RISE_M, _POSTS = 1.2, 0.17, 8
+"""How wide stairs and galleries are, a step's rise, and a railing's posts."""
+KINDS = {"interior": 90_001, "passage": 90_002, "stairwell": 90_003}
+"""What is built by number, 1 to 999, with the seeds; odd interiors are halls, even offices."""
 
 
-def build_interior(number: int, texels_per_m: float) -> Scene:
-    """The scene `interior-NUMBER`, from 1 to 999; raises `SimulatorError` for another."""
+def build_interior(kind: str, number: int, texels_per_m: float) -> Scene:
+    """The scene `KIND-NUMBER`, from 1 to 999; raises `SimulatorError` for another number."""
     if not 1 <= number <= 999:
-        raise SimulatorError(f"interior {number}; there are interior-1 to interior-999")
-    room = _Interior(np.random.default_rng([_HALLS_SEED, number]), texels_per_m, number % 2 == 1)
-    return _built(room, f"interior-{number}", ring_m=room.ring)
+        raise SimulatorError(f"{kind} {number}; there are {kind}-1 to {kind}-999")
+    hall = _Hall if number % 2 else _Office
+    made = {"interior": hall, "passage": _Passage, "stairwell": _Stairwell}[kind]
+    room = made(np.random.default_rng([KINDS[kind], number]), texels_per_m)
+    return _built(room, f"{kind}-{number}", ring_m=room.ring)
 
 
 def build_room(seed: int, number: int, texels_per_m: float = 80.0) -> Scene:

@@ -16,6 +16,7 @@ from ground_station.experiments.plan import FlightJob, LensJob, MapJob, RunJob
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.mapping.settings import MappingSettings
 from ground_station.simulator.plans import PHONE_CAMERA
+from ground_station.simulator.unsteady import unsteady
 
 TEXT = """
 seeds = [1, 2]
@@ -196,3 +197,6 @@ def test_the_shipped_flights_are_long_enough_for_what_happens_in_them():
         for case in experiment.cases:
             end_s = case.alter.dark_from_s + case.alter.dark_s
             assert case.flight.duration_s >= end_s + (1.0 if case.alter.dark_s else 0.0)
+            changes = unsteady(case.flight.exposure_steps, case.flight.light_steps)
+            for steps in (changes.exposure_ev, changes.light):
+                assert all(case.flight.duration_s > at_s + 0.9 for at_s in steps.time_s[:2])

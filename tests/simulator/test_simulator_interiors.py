@@ -17,16 +17,17 @@ from ground_station.simulator.textures import MATERIALS, TextureBank
 from tests.simulator.test_simulator_scenes import nearest_surface_m
 
 NUMBERS = range(1, 9)
+OTHERS = [f"{kind}-{number}" for kind in ("passage", "stairwell") for number in range(1, 6)]
 
 
 def interior(number: int) -> Scene:
     return scenes.build(f"interior-{number}", 10.0)
 
 
-@pytest.mark.parametrize("number", NUMBERS)
+@pytest.mark.parametrize("name", [*(f"interior-{number}" for number in NUMBERS), *OTHERS])
 @pytest.mark.parametrize(("plan", "clear_m"), [("walk", 0.5), ("tour", 0.35), ("fast", 0.5)])
-def test_who_goes_round_an_interior_touches_nothing(number: int, plan: str, clear_m: float) -> None:
-    scene = interior(number)
+def test_who_goes_round_an_interior_touches_nothing(name: str, plan: str, clear_m: float) -> None:
+    scene = scenes.build(name, 10.0)
     for seed in range(3):
         flown = plan_named(plan, scene, np.random.default_rng(seed))
         position, _ = Reference(flown, 0.0).at(np.linspace(0, 130, 300))
@@ -43,6 +44,31 @@ def test_odd_ones_are_halls_and_a_tour_flies_as_high_as_the_ceiling_lets_it() ->
         assert 1.9 < z.min() < 2.2 and z.max() <= min(7.0, max(2.06, height - 0.89))
 
 
+def test_a_passage_is_long_narrow_and_low_and_has_equal_doors() -> None:
+    for name in (name for name in OTHERS if name.startswith("passage")):
+        scene = scenes.build(name, 10.0)
+        length, width, height = scene.size_m
+        assert length > 5 * width and width < 3.5 and height < 3.3
+        doors = [s for s in scene.surfaces if s.material == "door"]
+        assert len(doors) >= 2 and len({s.options["print"] for s in doors}) == 1
+
+
+def test_stairs_rise_by_equal_steps_to_both_galleries() -> None:
+    for name in (name for name in OTHERS if name.startswith("stairwell")):
+        scene = scenes.build(name, 10.0)
+        plates = [s.options.get("print") for s in scene.surfaces]
+        step = 2 * interiors._PLATES
+        treads = [s.origin_m[2] for s, plate in zip(scene.surfaces, plates, strict=True)
+                  if plate == step and s.normal[2] > 0.9]  # fmt: skip
+        height = scene.size_m[2]
+        for level in (0.45 * height, 0.9 * height):
+            assert min(abs(np.array(treads) - level)) < 1e-9
+        rises = np.diff(sorted(treads))
+        assert rises.min() > 0.14 and rises.max() < 0.2 and len(treads) > 30
+        kinds = [f.kind for f in scene.footprints]
+        assert kinds.count("stairs") == kinds.count("balcony") == 2
+
+
 def test_each_is_another_building_and_the_same_each_time() -> None:
     found = [interior(number) for number in NUMBERS]
     assert len({scene.size_m for scene in found}) == len({s.texture_seed for s in found}) == 8
@@ -52,7 +78,8 @@ def test_each_is_another_building_and_the_same_each_time() -> None:
 
 def test_nothing_is_trained_on_the_materials_that_tell_an_interior() -> None:
     trained = {s.material for k in range(12) for s in interiors.build_room(1, k, 10.0).surfaces}
-    judged = {s.material for number in NUMBERS for s in interior(number).surfaces}
+    names = [*(f"interior-{number}" for number in NUMBERS), *OTHERS]
+    judged = {s.material for name in names for s in scenes.build(name, 10.0).surfaces}
     shared = {"door", "poster", "metal", "wood", "foliage", "sky", "concrete"}
     assert judged - shared == images.HELD_OUT and not trained & images.HELD_OUT
 
@@ -91,9 +118,11 @@ def test_a_walk_is_with_a_phone_and_its_speed_a_walkers() -> None:
     assert 1.4 < z.min() < z.max() < 1.8
 
 
-@pytest.mark.parametrize("name", ["interior-0", "interior-", "interior-1000", "interior-x"])
+@pytest.mark.parametrize(
+    "name", ["interior-0", "interior-", "interior-1000", "interior-x", "passage-0", "stairwell-"]
+)
 def test_an_interior_that_is_not_there_is_refused(name: str) -> None:
-    with pytest.raises(SimulatorError, match="interior"):
+    with pytest.raises(SimulatorError, match=name.partition("-")[0]):
         scenes.build(name, 10.0)
 
 

@@ -176,7 +176,7 @@ def test_an_interrupt_keeps_what_was_taken(tmp_path: Path) -> None:
             "scene 'cave' is unknown; there are: atrium, office, corridor, hall, hall-glazed, "
             "hall-above, hall-above-alike, rooms, board, atrium-moved-25, atrium-moved-50, "
             "atrium-moved, "
-            "atrium-moved-posted, interior-N",
+            "atrium-moved-posted, interior-N, passage-N, stairwell-N",
         ),
         ({"rate_hz": math.nan}, "rate_hz is nan; allowed: 0.1 to 120"),
         ({"duration_s": -1.0}, "duration_s is -1; allowed: above 0 to 3600"),
