@@ -15,11 +15,41 @@ from ground_station.localization.kinematics import Kinematics, Solution, no_solu
 from ground_station.localization.matching import Matcher
 from ground_station.localization.tracking import Keyframe, track
 
-REMEMBERED = 12
-"""Frames kept for catching up with a search's result: it may take 0.4 s at 30 Hz."""
+_REMEMBERED = 32
+"""Frames kept at most for catching up with a search's result."""
+_STEPS, _STEP_S = 3, 0.14
+"""Of the frames in between so many are solved on the way, or one each so many seconds where these
+are more: KLT needs steps within its reach."""
 
-_STEPS = 3
-"""Frames of those in between that are solved on the way: KLT needs steps within its reach."""
+
+class Since:
+    """Frames since a search began, at most so many: the longer it takes, the farther apart.
+
+    A search that takes 0.1 s on one computer takes three seconds on another, or on a busy one.
+    """
+
+    def __init__(self) -> None:
+        self.begin()
+
+    def begin(self) -> None:
+        """Forgets all frames."""
+        self._kept: list[tuple[int, U8]] = []
+        self._last: tuple[int, U8] | None = None
+        self._stride, self._count = 1, 0
+
+    def add(self, time_ns: int, image: U8) -> None:
+        """Remembers a frame (H, W), the next in time."""
+        self._last = (time_ns, image)
+        if self._count % self._stride == 0:
+            self._kept.append(self._last)
+        self._count += 1
+        if len(self._kept) == _REMEMBERED:
+            self._kept, self._stride = self._kept[::2], 2 * self._stride
+
+    def after(self, time_ns: int) -> list[tuple[int, U8]]:
+        """Those later than a time, the last of all among them."""
+        last = [self._last] if self._last is not None and self._last is not self._kept[-1] else []
+        return [frame for frame in self._kept + last if frame[0] > time_ns]
 
 
 @dataclass(frozen=True)
@@ -83,18 +113,19 @@ def better(landed: Keyframe, present: Keyframe | None, followed: Followed | None
 
 def catch_up(
     landed: Acquired,
-    recent: list[tuple[int, U8]],
+    since: list[tuple[int, U8]],
     matcher: Matcher,
     estimator: Estimator,
 ) -> bool:
-    """Brings a fresh estimator from a found frame through some of the frames since.
+    """Brings a fresh estimator from a found frame through some of the frames `since`, in order.
 
     False when its points cannot be followed that far.
     """
     assert landed.state is not None and landed.keyframe is not None
     estimator.restart(landed.time_ns, landed.state.wTc, landed.state.covariance[:6, :6])
-    since = [frame for frame in recent if frame[0] > landed.time_ns]
-    steps = np.linspace(0, max(len(since) - 1, 0), _STEPS + 1).astype(int)
+    span_s = (since[-1][0] - landed.time_ns) / 1e9 if since else 0.0
+    count = max(_STEPS, int(np.ceil(span_s / _STEP_S)))
+    steps = np.linspace(0, max(len(since) - 1, 0), count + 1).astype(int)
     for step in np.unique(steps)[1:]:
         time_ns, image = since[step]
         predicted = estimator.predict(time_ns)

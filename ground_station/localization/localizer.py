@@ -92,7 +92,7 @@ class Localizer:
         self._followed: Followed | None = None
         self._located: Located | None = None
         self._refused = ""
-        self._recent: deque[tuple[int, U8]] = deque(maxlen=following.REMEMBERED)
+        self._since = following.Since()
         self._energies: deque[float] = deque(maxlen=self.settings.blur.recent_frames)
         self._seen: Indices | None = None
         self._last_frame_ns: int | None = None
@@ -183,7 +183,7 @@ class Localizer:
         else:
             estimate = self._follow(attempt, image)
             if whole:
-                self._recent.append((time_ns, image))
+                self._since.add(time_ns, image)
         self._idle_since_s = perf_counter()
         return estimate
 
@@ -339,6 +339,7 @@ class Localizer:
         if self._worker.busy or not whole or not self._may_search(attempt.time_ns):
             return
         time_ns = self._last_search_ns = attempt.time_ns
+        self._since.begin()
         expected = [] if self._gone(time_ns) else self._expected(attempt)
         search = self._acquirer.search
         job = partial(search, time_ns, image, expected, self._fresh, attempt.taken)
@@ -365,7 +366,8 @@ class Localizer:
         if back:
             return False  # tracking came back by itself while the whole map was searched
         estimator = self._fresh()
-        caught_up = following.catch_up(landed, list(self._recent), self._matcher, estimator)
+        since = self._since.after(landed.time_ns)
+        caught_up = following.catch_up(landed, since, self._matcher, estimator)
         attempt.watch.lap("catch_up")
         if not caught_up:
             return False

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,9 +15,10 @@ from ground_station.localization.acquisition import Acquirer
 from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.estimate import Counts, no_observations
 from ground_station.localization.estimator import make_estimator
-from ground_station.localization.following import Followed, better, catch_up
+from ground_station.localization.following import Followed, Since, better, catch_up
 from ground_station.localization.judge import covariance_in_map, covariance_in_world
 from ground_station.localization.kinematics import no_solution
+from ground_station.localization.localizer import Localizer
 from ground_station.localization.matching import Matcher, describe
 from ground_station.localization.relocalization import Relocalization
 from ground_station.localization.settings import CovarianceSettings, for_live, load_preset
@@ -297,6 +299,68 @@ def test_catching_up_gives_up_where_the_points_are_not(room, acquirer):
     fresh = make_estimator(room.camera, load_preset("default"))
     recent = [(k * 33_000_000, noise[min(k, 1)]) for k in range(4)]
     assert not catch_up(landed, recent, acquirer.matcher, fresh)
+
+
+class Turning:
+    """A camera that turns on the spot; only its first view is ever described, and not at once."""
+
+    name, sha256, dimension, distance_scale = "synthetic", "0" * 64, 64, 1.0
+
+    def __init__(self, room, wTc):
+        self.seen, self.asked = room.features(wTc, noise_px=0.0, outliers=0.0), 0
+        self.camera = camera = room.camera
+        self.first = np.zeros((480, 640))
+        for side in (4, 16, 32):  # as walls have it: coarse and fine
+            shades = room.rng.uniform(0, 80, (480 // side, 640 // side))
+            self.first += np.kron(shades, np.ones((side, side)))
+        columns, rows = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
+        self.rays = camera.rays(np.stack([columns.ravel(), rows.ravel()], axis=1))
+
+    def extract(self, image):
+        self.asked += 1
+        return self.seen if self.asked > 1 else self.seen.where(np.zeros(len(self.seen), bool))
+
+    def turned(self, angle_rad):
+        """The first view's picture after a turn to the right, and the turn (4, 4)."""
+        turn = poses.exp(np.array([0, angle_rad, 0, 0, 0, 0]))
+        place = self.camera.project(self.rays @ turn[:3, :3].T).astype(np.float32)
+        maps = place.reshape(self.camera.height_px, self.camera.width_px, 2)
+        picture = cv2.remap(self.first, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        return np.asarray(np.rint(picture), np.uint8), turn
+
+
+@pytest.mark.parametrize("lag_s", [0.3, 1.5])
+def test_a_search_that_takes_long_is_caught_up_with_over_all_that_was_turned_since(room, lag_s):
+    """As on a slow computer, or a busy one: it was lost for as long as the camera moved."""
+    wTc = room.path(1)[1][0]
+    camera = Turning(room, wTc)
+    settings = load_preset("default")
+    tracking = dataclasses.replace(settings.tracking, features_lag_s=lag_s)
+    localizer = Localizer(
+        room.map, room.camera, camera, dataclasses.replace(settings, tracking=tracking)
+    )
+    for k in range(round(30 * lag_s) + 5):
+        picture, turn = camera.turned(0.2 * max(k - 1, 0) / 30)
+        found = localizer.process(k * 33_333_333, picture, k)
+        if found.wTc is not None:
+            break
+    assert found.wTc is not None and k >= 30 * lag_s
+    off = poses.log(poses.inverse(wTc @ turn) @ found.wTc)
+    assert np.rad2deg(np.linalg.norm(off[:3])) < 0.2 and np.linalg.norm(off[3:]) < 0.02
+
+
+def test_frames_since_a_search_are_few_and_evenly_apart_and_end_with_the_last():
+    since = Since()
+    frames = [(10 * k, np.full((2, 2), k % 250, np.uint8)) for k in range(301)]
+    for count, frame in enumerate(frames, 1):
+        since.add(*frame)
+        kept = [time_ns for time_ns, _ in since.after(-1)]
+        assert kept[0] == 0 and kept[-1] == frame[0] and len(kept) <= 33
+        assert len(kept) == count or len(kept) >= 16
+        assert len(set(np.diff(kept[:-1]))) <= 1
+    assert [time_ns for time_ns, _ in since.after(2900)] == kept[kept.index(2880) + 1 :]
+    since.begin()
+    assert since.after(-1) == []
 
 
 def test_what_frames_have_in_common_is_no_less_for_many_than_for_one():
