@@ -9,7 +9,7 @@ from ground_station.simulator.simulate import SimulationSettings, simulate
 
 
 def stem(flight: FlightDeclaration, seed: int) -> str:
-    """How a simulated flight is called for who looks into the folder; a job's key tells the rest."""
+    """How a simulated flight is called; its job's key tells the rest."""
     rate = f"-{flight.bitrate_kbps}kbps" if flight.bitrate_kbps else ""
     air = "" if flight.draught_m_s is None else f"-{flight.draught_m_s:g}ms"
     crowd = f"-{flight.people}people" if flight.people else ""
