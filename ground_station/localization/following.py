@@ -17,7 +17,7 @@ from ground_station.localization.tracking import Keyframe, track
 
 _REMEMBERED = 32
 """Frames kept at most for catching up with a search's result."""
-_STEPS, _STEP_S = 3, 0.14
+_STEPS, _STEP_S = 3, 0.25
 """Of the frames in between so many are solved on the way, or one each so many seconds where these
 are more: KLT needs steps within its reach."""
 
