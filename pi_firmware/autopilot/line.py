@@ -15,7 +15,7 @@ import serial
 from pymavlink.dialects.v20 import common as mavlink
 
 from pi_firmware.autopilot import Autopilot
-from pi_firmware.autopilot.poses import PoseGate
+from pi_firmware.autopilot.poses import PoseGate, VehiclePose
 from pi_firmware.settings import AutopilotSettings
 from pi_firmware.wire.messages import Autopilot as State
 from pi_firmware.wire.messages import Pose
@@ -33,6 +33,32 @@ _UNKNOWN_MV = 0xFFFF
 def _quality(share: float | None) -> int:
     """As MAVLink has it: percent from 1, 0 where it is not known."""
     return 0 if share is None else round(min(max(100 * share, 1), 100))
+
+
+def as_mavlink(usec: int, pose: VehiclePose, quality: float | None, resets: int) -> Any:
+    """The message for a pose: an `ODOMETRY`, or without a velocity a `VISION_POSITION_ESTIMATE`."""
+    if pose.velocity_mps is not None and pose.turn_radps is not None:
+        return mavlink.MAVLink_odometry_message(
+            usec,
+            mavlink.MAV_FRAME_LOCAL_FRD,  # the one that both ArduPilot and PX4 take
+            mavlink.MAV_FRAME_BODY_FRD,
+            *pose.position_m.tolist(),
+            pose.quaternion_wxyz(),
+            *pose.velocity_mps.tolist(),
+            *pose.turn_radps.tolist(),
+            pose.upper_triangle(),
+            [math.nan] + [0.0] * 20,
+            resets,
+            mavlink.MAV_ESTIMATOR_TYPE_VISION,
+            _quality(quality),
+        )
+    return mavlink.MAVLink_vision_position_estimate_message(
+        usec,
+        *(float(v) for v in pose.position_m),
+        *(float(v) for v in pose.angles_rad),
+        pose.upper_triangle(),
+        resets,
+    )
 
 
 class SerialAutopilot(Autopilot):
@@ -176,27 +202,8 @@ class SerialAutopilot(Autopilot):
         pose = self.poses.take(message, time.time_ns())
         if pose is None:
             return None
-        if pose.velocity_mps is not None and pose.turn_radps is not None:
-            return mavlink.MAVLink_odometry_message(
-                message.capture_ns // 1000,
-                mavlink.MAV_FRAME_LOCAL_FRD,  # the one that both ArduPilot and PX4 take
-                mavlink.MAV_FRAME_BODY_FRD,
-                *pose.position_m.tolist(),
-                pose.quaternion_wxyz(),
-                *pose.velocity_mps.tolist(),
-                *pose.turn_radps.tolist(),
-                pose.upper_triangle(),
-                [math.nan] + [0.0] * 20,
-                self.poses.reset_counter,
-                mavlink.MAV_ESTIMATOR_TYPE_VISION,
-                _quality(message.quality),
-            )
-        return mavlink.MAVLink_vision_position_estimate_message(
-            message.capture_ns // 1000,
-            *(float(v) for v in pose.position_m),
-            *(float(v) for v in pose.angles_rad),
-            pose.upper_triangle(),
-            self.poses.reset_counter,
+        return as_mavlink(
+            message.capture_ns // 1000, pose, message.quality, self.poses.reset_counter
         )
 
     def _hear(self, data: bytes) -> None:
