@@ -1,0 +1,1 @@
+"""A payload's pose, from a ground station's Foxglove port to ROS 2."""
