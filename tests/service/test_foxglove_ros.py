@@ -14,13 +14,12 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
-from foxglove_stand import PAYLOAD, Station, estimate, server
+from foxglove_stand import PAYLOAD, ROOT, Station, estimate, server
 from waiting import eventually
 
-import ground_station.service.foxglove as room
 from pi_firmware import __version__
 
-PACKAGE = Path(room.__file__).parent / "blimp_ros"
+PACKAGE = ROOT / "deploy/ground_station/blimp_ros"
 
 
 class Ros:
