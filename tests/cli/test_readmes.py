@@ -4,45 +4,22 @@ from __future__ import annotations
 
 import ast
 import re
-import shlex
-import textwrap
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+from pages import PAGES, ROOT, blocks, commands
 
 from deploy.flash.__main__ import _parser as flash
 from ground_station.cli import parser as blimp
 from hw.command import parser as hw
 from pi_firmware.__main__ import _parser as firmware
 
-ROOT = Path(__file__).parents[2]
-ROOMS = ("deploy", "ground_station", "hw", "maps", "pi_firmware", "tests")
-PAGES = [ROOT / "README.md", *(page for room in ROOMS for page in (ROOT / room).rglob("README.md"))]
 TARGETS = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 MOST_WORDS, MOST_PICTURE_BYTES = 1200, 200 * 1024
 PARSERS: dict[str, Callable[[], object]] = {
     "blimp": blimp, "hw": hw, "deploy.flash": flash, "pi_firmware": firmware,
 }  # fmt: skip
-
-
-def blocks(page: Path) -> Iterator[str]:
-    """The indented blocks of a page, whole; those of a list are indented by more."""
-    for block in re.findall(r"(?:^ {4,}.*\n|^\n(?= {4}))+", page.read_text(), re.MULTILINE):
-        yield textwrap.dedent(block).strip("\n")
-
-
-def commands(page: Path) -> Iterator[list[str]]:
-    """The words of each command line of ours in a page's blocks, without prompt and comment."""
-    for block in blocks(page):
-        for line in block.replace("\\\n", " ").splitlines():
-            for part in re.split(r"\s#\s|\s{6,}(?=[a-z])", line)[0].split(";"):
-                words = shlex.split(part) if part.count("'") % 2 == 0 else []
-                words = [word for word in words if word != "sudo" and not word.startswith("blimp=")]
-                if words and Path(words[0]).name in ("make", "blimp", "$blimp"):
-                    yield [Path(words[0]).name.removeprefix("$"), *words[1:]]
-                elif len(words) > 2 and words[1] == "-m" and words[2] in PARSERS:
-                    yield words[2:]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
@@ -32,6 +34,7 @@ from pi_firmware.wire.recording import ESTIMATE_TOPIC, VIDEO_TOPIC, RecordingRea
 
 pytestmark = pytest.mark.alone
 
+PAGE = Path(__file__).parents[2] / "ground_station/service/README.md"
 NAME = "blimp-1"
 CUT_S = 1.0
 """What a power cut may cost of a recording."""
@@ -113,6 +116,7 @@ def test_the_demo_from_its_start_to_a_trajectory_and_its_end(tmp_path: Path) -> 
             service.record(active=False)
             eventually(lambda: not service.state()["recording"]["active"])
         refuses_a_port_in_use(service)
+        gives_poses_to_a_program_as_its_page_has_it(service)
         (listed,) = service.client.get("/api/recordings").json()
         path = service.recordings / listed["file"]
         assert listed["duration_s"] > 0 and not listed["active"]
@@ -146,6 +150,19 @@ def is_whole(path: Path) -> None:
     assert videos == [sample.data for sample in pictures]
     frames = [m.frame_id for name, m in read if name == "foxglove.PoseInFrame"]
     assert frames == ["world"] * len(poses)
+
+
+def gives_poses_to_a_program_as_its_page_has_it(service: Service) -> None:
+    """The program of README, at this station's port, prints where the payload is."""
+    program = re.search(r"^ +import json, zenoh\n(?: +.*\n)+", PAGE.read_text(), re.MULTILINE)
+    assert program is not None
+    typed = textwrap.dedent(program[0]).replace("tcp/127.0.0.1:7447", service.endpoint)
+    words = [sys.executable, "-u", "-c", typed]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as reader:
+        assert reader.stdout is not None
+        key, position_m = reader.stdout.readline().split(maxsplit=1)
+        reader.terminate()
+    assert key == "blimp/demo/pose" and len(json.loads(position_m)) == 3
 
 
 class OnDisk:

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from quick_flight import quick_settings
+from quick_flight import quick_light, quick_settings
 
 from ground_station.arrays import F32, F64, U8
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
-from ground_station.simulator import lighting, textures
+from ground_station.simulator import lighting
 from ground_station.simulator import simulate as flights
 from ground_station.simulator.building import SceneBuilder
 from ground_station.simulator.imaging import FrameMaker, covering_pinhole
@@ -64,14 +64,8 @@ _kept_lit_scene = functools.cache(lighting.lit_scene.__wrapped__)
 
 @contextmanager
 def coarse_light() -> Iterator[None]:
-    """Smaller fields for textures, light from fewer directions and in a coarser map of the sun.
-
-    Each lit scene is kept.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(textures, "_FIELD_SIZE", 256)
-        patch.setattr(lighting, "_SKY_DIRECTIONS", 8)
-        patch.setattr(lighting, "_SUN_MAP_PX", 1024)
+    """Quick light, and each lit scene is kept."""
+    with quick_light() as patch:
         patch.setattr(flights, "lit_scene", _kept_lit_scene)
         yield
 

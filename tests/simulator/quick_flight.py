@@ -2,9 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
+
+from ground_station.simulator import lighting, textures
 from ground_station.simulator.simulate import SimulationSettings
+
+
+@contextmanager
+def quick_light() -> Iterator[pytest.MonkeyPatch]:
+    """Smaller fields for textures, light from fewer directions and in a coarser map of the sun."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(textures, "_FIELD_SIZE", 256)
+        patch.setattr(lighting, "_SKY_DIRECTIONS", 8)
+        patch.setattr(lighting, "_SUN_MAP_PX", 1024)
+        yield patch
 
 
 def quick_settings(out: Path, **changes: object) -> SimulationSettings:
