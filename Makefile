@@ -70,7 +70,7 @@ test: setup  ## Run the tests of every room
 check: setup  ## Lint, formatting, types, and which room may import which
 	@.venv/bin/ruff check .
 	@.venv/bin/ruff format --check .
-	@.venv/bin/mypy
+	@.venv/bin/mypy -n auto
 	@.venv/bin/lint-imports --no-cache
 
 hil: setup  ## Replay tests: PAYLOAD=process|image|ssh:user@host[:port] CASES="loss outage"
