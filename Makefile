@@ -87,10 +87,10 @@ bench: setup  ## Measure localizer, payload and features: costs in ratios of one
 experiments: setup  ## The thesis's experiments and more: NAMES="motion fast", OPTIONS=--quick
 	@$(BLIMP) experiments $(NAMES) --out out/experiments $(OPTIONS)
 
-budget: setup  ## Reckon the default build: table and plots in out/budget; status 1 without margin
+budget: setup  ## Compute the default build's budget: table and plots in out/budget; status 1 without margin
 	@.venv/bin/python -m hw budget --out out/budget
 
-soak: setup  ## Fly the firmware HOURS=0.5 over a lossy link: leaks, latency, clock, each frame told
+soak: setup  ## Fly the firmware HOURS=0.5 over a lossy link: leaks, latency, clock, every frame accounted for
 	@mkdir -p out
 	@.venv/bin/python tests/faults/soak.py --hours "$(or $(HOURS),0.5)" --loss 0.02 --out out/soak.json
 

@@ -1,4 +1,4 @@
-"""What each command of `python -m hw` reckons and prints."""
+"""What each command of `python -m hw` computes and prints."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from hw import inverse, output, tables
 from hw.builds import Conditions, shipped_builds, with_ballast
-from hw.buoyancy import THESIS_GROSS_G, gross_lift_g, gross_of, margin_g, reckon
+from hw.buoyancy import THESIS_GROSS_G, gross_lift_g, gross_of, margin_g, margin_of
 from hw.command import CONDITIONS, MASSES, WEAR
 from hw.endurance import Wear
 from hw.envelopes import Envelope, of_shape, of_volume
@@ -156,11 +156,11 @@ def endurance(args: argparse.Namespace) -> int:
 
 
 def budget(args: argparse.Namespace) -> int:
-    """The whole reckoning of one build; 1 when its margin is not positive."""
+    """The whole budget of one build; 1 when its margin is not positive."""
     build = shipped_builds().named(args.build)
     if args.out is not None:
-        output.make_folder(args.out)  # refused before anything is reckoned
-    margin = reckon(build)
+        output.make_folder(args.out)  # refused before anything is computed
+    margin = margin_of(build)
     endurance_table, flights = tables.endurance_table(build, Wear())
     text = "\n\n".join([
         f"{build.name}: {build.about}", tables.mass_budget(build, margin).text(),

@@ -107,7 +107,7 @@ def _mass_spreads(build: Build) -> dict[str, float]:
     return spreads
 
 
-def reckon(build: Build) -> Margin:
+def margin_of(build: Build) -> Margin:
     """Everything about a build's margin."""
     parts, margin = sigmas(build), margin_g(build)
     sigma = math.hypot(*parts.values())

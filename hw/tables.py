@@ -13,7 +13,7 @@ from pathlib import Path
 
 from hw import output
 from hw.builds import Build, Catalogue, shipped_builds
-from hw.buoyancy import THESIS_GROSS_G, Margin, gross_lift_g, gross_of, margin_g, reckon, sigmas
+from hw.buoyancy import THESIS_GROSS_G, Margin, gross_lift_g, gross_of, margin_g, margin_of, sigmas
 from hw.endurance import MODES, Endurance, Wear, fly
 from hw.flight import balance_of, climb_of
 from hw.inverse import ballast_to_neutral, most_battery, payload_cell, smallest_envelope
@@ -188,7 +188,7 @@ def sections() -> dict[str, str]:
         "parts": bill_of_materials(parts),
         "sources": citations(parts),
         "builds": builds_table(catalogue),
-        "mass": mass_budget(build, reckon(build)),
+        "mass": mass_budget(build, margin_of(build)),
         "answers": answers(build),
         "endurance": endurance,
         "erratum": erratum(),

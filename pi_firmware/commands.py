@@ -180,7 +180,7 @@ def actions(
     _, fastest = range_of(EncoderSettings, "bitrate_kbps")
     exposures = {name: range_of(CameraSettings, name) for name in ("exposure_s", "gain")}
     off = end_with("battery.shutdown_command", settings.battery.shutdown_command)
-    anew = end_with("supervision.reboot_command", settings.supervision.reboot_command)
+    reboot = end_with("supervision.reboot_command", settings.supervision.reboot_command)
     return {
         "idr": Action(capture.force_idr),
         "bitrate": Action(set_bitrate, {"kbps": (slowest, fastest)}, frozenset({"kbps"})),
@@ -188,5 +188,5 @@ def actions(
         "record-start": Action(record),
         "record-stop": Action(end_recording),
         "shutdown": disarmed(off),
-        "reboot": disarmed(anew),
+        "reboot": disarmed(reboot),
     }

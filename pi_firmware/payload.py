@@ -28,7 +28,7 @@ _FLUSH_LIMIT_S = 10.0
 _COMMAND_LIMIT_S = 30.0
 _LOOK_S = 1.0
 _RENEWED_S = 10.0
-"""A session that was opened anew hears the ground station within this."""
+"""A session that was opened again hears the ground station within this."""
 
 
 class Reporter:

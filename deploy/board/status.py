@@ -78,7 +78,7 @@ NO_PROVISIONING = Fault(
 REFUSED = Fault(
     3,
     "something in this folder is refused; what was in force before still is",
-    "Mend what the reason names, here on the boot partition, and start the payload again.",
+    "Fix what the reason names, here on the boot partition, and start the payload again.",
 )
 NO_VIDEO = Fault(
     4,

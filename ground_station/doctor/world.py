@@ -104,7 +104,7 @@ def certificate(settings: StationSettings) -> Finding:
         found = f"none, and video.host is {settings.video.host}: plain RTP can be forged"
         fix = f"blimp keys ground {settings.name}, then set telemetry.certificates"
         return warning(name, found, fix)
-    anew = f"copy the folder of 'blimp keys ground {settings.name}' here again"
+    again = f"copy the folder of 'blimp keys ground {settings.name}' here again"
     try:
         held = credentials.load(text)
         common, until = inspect(held.folder)
@@ -112,11 +112,11 @@ def certificate(settings: StationSettings) -> Finding:
         found = f"{error.filename}: not this user's to read"
         return warning(name, found, "run the doctor as the service's user: sudo -u blimp")
     except (BlimpError, OSError) as error:
-        return problem(name, str(error), anew)
+        return problem(name, str(error), again)
     expected = f"{credentials.GROUND}.{settings.name}"
     if common != expected or held.name != expected:
         return problem(
-            name, f"it is {common}'s, this station is {expected}", f"{anew}, or set name"
+            name, f"it is {common}'s, this station is {expected}", f"{again}, or set name"
         )
     return _lasting(held, until)
 

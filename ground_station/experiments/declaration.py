@@ -45,7 +45,7 @@ class FlightDeclaration:
     draught_m_s: float | None = config.key(
         None, "deviation of the air's speed, which makes the blimp swing", unit="m/s", low=0, high=2
     )
-    people: int = config.key(0, "who walk to and fro", low=0, high=100)
+    people: int = config.key(0, "who walk back and forth", low=0, high=100)
     storey_m: float = config.key(
         0.0,
         "height of its floor above the map's, which has nothing of it",

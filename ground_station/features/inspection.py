@@ -81,7 +81,7 @@ def check(proto: onnx.ModelProto, info: ModelInfo) -> None:
     """Raises `FeatureError` with one line unless the graph is a feature network of that layout.
 
     That is: operators of ONNX itself and of the list above, all values in the file, inputs and
-    outputs of the layout's names, types and shapes, and no array so large, nor so much to reckon,
+    outputs of the layout's names, types and shapes, and no array so large, nor so much to compute,
     that a picture would exhaust the machine.
     """
     _check_operators(proto)

@@ -147,7 +147,7 @@ def _way(images: int, rng: np.random.Generator) -> I64:
     while len(way) < wanted:
         turns = [turn for turn in (0, 1, 3) if _is_inside(here + _AXES[(heading + turn) % 4], side)]
         turns = turns or [2]
-        # Where it went least, by chance among equals; straight on a little rather than around.
+        # Where it went least, at random among equals; straight on a little rather than around.
         cost = [
             gone.get((*here, *_AXES[(heading + turn) % 4]), 0) + 0.5 * rng.random() + 0.1 * turn
             for turn in turns

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="atrium",
         help="atrium, office, corridor, hall (repeating panels), hall-glazed (a wall of dark"
         " glass), hall-above (the floor above: panels at the same places), hall-above-alike (of"
-        " the same prints), rooms (a flat), board (a calibration board), and by chance, 1 to 999:"
+        " the same prints), rooms (a flat), board (a calibration board), and procedural, 1 to 999:"
         " interior-N (odd halls, even offices), passage-N, stairwell-N;"
         " atrium-moved (other furniture; -25 and -50: a quarter, half of it moved),"
         " atrium-moved-posted (and other posters) (default: atrium)",
@@ -76,7 +76,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="V",
         help="deviation of the air's speed (default: 0.05)",
     )
-    add("--people", type=int, default=0, metavar="N", help="so many walk to and fro (default: 0)")
+    add(
+        "--people",
+        type=int,
+        default=0,
+        metavar="N",
+        help="so many walk back and forth (default: 0)",
+    )
     add(
         "--processing",
         default="none",

@@ -105,7 +105,7 @@ def carry(
 
 
 def hold(plan: Plan, times_s: F64, rng: np.random.Generator) -> Motion:
-    """Holds the camera still at a plan's stands, in an order by chance, one at each time (N,)."""
+    """Holds the camera still at a plan's stands, in random order, one at each time (N,)."""
     stands = rng.permutation(plan.stands)[: len(times_s)]
     position, yaw = plan.shape((stands + 0.5) / plan.stands)
     angles = np.radians(_STILL_DEG) * rng.standard_normal((len(stands), 3))

@@ -1,4 +1,4 @@
-"""Interiors by chance, built of the simulator's surfaces: some to learn from, others to judge in.
+"""Procedural interiors, built of the simulator's surfaces: some to learn from, others to judge in.
 
 `build_room` is what training sees. `build_interior` is what localizers are judged in: of other
 materials, with prints that repeat, blank bays, screens, and a way kept free for who walks or flies
@@ -20,7 +20,7 @@ Rng = np.random.Generator
 
 
 class _Room:
-    """A box of random size, cut into bays; every wall, window and thing in it by chance."""
+    """A box of random size, cut into bays; every wall, window and thing in it random."""
 
     WALLS: tuple[str, ...] = ("plaster", "plaster", "brick", "concrete", "wood")
     FLOORS: tuple[str, ...] = ("terrazzo", "wood", "concrete")
@@ -240,7 +240,7 @@ class _Interior(_Room):
             self._stand(float(x), float(y), float(w), float(d), (0.4, 1.5))
 
     def _stand(self, x: float, y: float, w: float, d: float, high_m: tuple[float, float]) -> None:
-        """A piece of furniture about a place, of a height by chance."""
+        """A piece of furniture about a place, of a random height."""
         top = float(self.rng.uniform(*high_m))
         material = str(self.rng.choice(self.SOLIDS))
         self.b.stand((x - w / 2, y - d / 2, 0.0), (x + w / 2, y + d / 2, top), material,

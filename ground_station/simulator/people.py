@@ -1,4 +1,4 @@
-"""People who walk to and fro where the map has seen nobody.
+"""People who walk back and forth where the map has seen nobody.
 
 Each is an upright figure of legs, a coat with a pattern and a head, lit as the scene is on average:
 their shadows, and what they hide from each other's light, are left out.
@@ -26,7 +26,7 @@ _PATTERN = 12
 
 @dataclass(frozen=True)
 class Walker:
-    """One who goes to and fro between `ends_m` (2, 2); `along_m` of the way are behind at 0 s.
+    """One who goes back and forth between `ends_m` (2, 2); `along_m` of the way are behind at 0 s.
 
     Colours are 8-bit: a `coat` (S, S, 3) and its sides alike, `legs` (3,), `skin` (3,).
     """

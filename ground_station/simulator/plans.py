@@ -250,7 +250,7 @@ def _stills(centre: tuple[float, float], shift: F64) -> Plan:
 
 
 def _headset(scene: Scene, centre: tuple[float, float], shift: F64) -> Plan:
-    """30 m on foot through rooms: once around a short walk, or part of a long one, by chance."""
+    """30 m on foot through rooms: once around a short walk, or part of a long one, at random."""
     if not scene.walks:
         raise SimulatorError(
             f"plan 'headset' walks through doorways; scene '{scene.name}' has none: --scene rooms"

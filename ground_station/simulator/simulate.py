@@ -61,7 +61,7 @@ class SimulationSettings:
 
     `exposure_steps`, `light_steps` and `flicker` are as `unsteady` reads them; with a
     `longest_exposure_s` gain does what time may not, as against motion blur. So many `people` walk
-    to and fro.
+    back and forth.
 
     `processing` is what the camera does to its pictures: "none", a perfect sensor's but for noise,
     or "camera", a mosaic of colours that is demosaiced, denoised and sharpened.

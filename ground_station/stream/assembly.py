@@ -38,7 +38,7 @@ class Stamps:
         """A frame's RTP timestamp and numbers."""
         self._known = [*self._known[-1:], (timestamp, info)]
 
-    def reckon(self, timestamp: int) -> FrameInfo | None:
+    def estimate(self, timestamp: int) -> FrameInfo | None:
         """The numbers of a frame with this timestamp; None where they are not certain.
 
         Its exposure and what the gate saw of it are those of the frame before.
@@ -175,7 +175,7 @@ class Assembly:
             data, info = unit.data, sei.find(unit.data)
             if info is not None:
                 self._stamps.take(unit.timestamp, info)
-            elif not unit.complete and (info := self._stamps.reckon(unit.timestamp)) is not None:
+            elif not unit.complete and (info := self._stamps.estimate(unit.timestamp)) is not None:
                 data = annexb.insert_before_slice(data, sei.encode(info))
             if info is None or min(info.time_ns, info.clock_ns) < 0:
                 self._counters.unstamped += 1

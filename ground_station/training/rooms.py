@@ -1,4 +1,4 @@
-"""Rooms by chance, drawn in several lights from one place.
+"""Random rooms, drawn in several lights from one place.
 
 None is the `atrium` or the `office`: localizers are judged there, so the network never sees them.
 """

@@ -1,4 +1,4 @@
-"""A long flight of the real program over a lossy link: nothing leaks, clock true, each frame told.
+"""A long flight of the real program over a lossy link: no leaks, no frame unaccounted for.
 
     python tests/faults/soak.py --hours 0.5 --loss 0.02 --out out/soak.json
 

@@ -1,4 +1,4 @@
-"""What a long flight must add up to: each frame told, end to end, one by one."""
+"""What a long flight must add up to: every frame accounted for, end to end, one by one."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hw.builds import Build, Conditions, Hull, shipped_builds
-from hw.buoyancy import gross_lift_g, gross_of, lift_in, margin_g, reckon
+from hw.buoyancy import gross_lift_g, gross_of, lift_in, margin_g, margin_of
 from hw.quantities import RANGES
 
 THESIS_M3 = 0.1905
@@ -81,8 +81,8 @@ def test_a_measured_free_lift_takes_the_place_of_film_and_gas() -> None:
     hull = replace(build.hull, free_lift_g=lift - film.mass_g, free_lift_spread_g=0.5)
     measured = replace(build, hull=hull)
     assert margin_g(measured) == pytest.approx(margin_g(build), abs=1e-5)
-    assert reckon(measured).sigma_g < reckon(build).sigma_g
-    assert "temperature_C" not in reckon(measured).parts_sigma_g
+    assert margin_of(measured).sigma_g < margin_of(build).sigma_g
+    assert "temperature_C" not in margin_of(measured).parts_sigma_g
 
 
 def test_drawn_and_propagated_uncertainty_agree() -> None:
@@ -99,7 +99,7 @@ def test_drawn_and_propagated_uncertainty_agree() -> None:
         volume = hull.envelope.volume_m3 * rng.normal(1.0, hull.volume_sigma_percent / 100)
         mass = math.fsum(rng.normal(item.mass_g, item.spread_g) for item in build.items)
         drawn.append(lift_in(replace(day, **state), volume) - mass)
-    margin = reckon(build)
+    margin = margin_of(build)
     # 2500 draws know a standard deviation to 1.4 %, a mean to 2 % of it.
     assert np.std(drawn) == pytest.approx(margin.sigma_g, rel=0.05)
     assert np.mean(drawn) == pytest.approx(margin.margin_g, abs=0.08 * margin.sigma_g)
@@ -113,7 +113,7 @@ def test_a_linear_input_propagates_exactly() -> None:
     hull = Hull("h", "h", shape="sphere", diameter_m=0.7, volume_sigma_percent=2, film_g_m2=20,
                 film_citation="test", stations={"gondola": (0.0, -0.3)})  # fmt: skip
     build = Build("b", "", hull, (), day)
-    margin = reckon(build)
+    margin = margin_of(build)
     assert margin.sigma_g == pytest.approx(0.02 * margin.gross_g)
     assert list(margin.parts_sigma_g) == ["volume"]
 

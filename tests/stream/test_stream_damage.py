@@ -126,22 +126,22 @@ def info(sequence: int, time_ns: int) -> sei.FrameInfo:
     return sei.FrameInfo(sequence, time_ns, time_ns + 5, 7.0, 1.0)
 
 
-def test_a_stamp_is_reckoned_by_the_rtp_clock_where_that_is_certain() -> None:
+def test_a_stamp_is_estimated_by_the_rtp_clock_where_that_is_certain() -> None:
     stamps = Stamps()
     stamps.take(0xFFFFFFFF - 2999, info(7, 10**9))
-    assert stamps.reckon(0) is None  # of one frame nothing can be told
+    assert stamps.estimate(0) is None  # of one frame nothing can be told
     stamps.take(0, info(8, 10**9 + 33_400_000))
-    next_one = stamps.reckon(3000)
+    next_one = stamps.estimate(3000)
     assert next_one is not None and next_one.sequence == 9
     assert next_one.time_ns == 10**9 + 33_400_000 + 33_333_333 == next_one.clock_ns - 5
-    after_one = stamps.reckon(6010)  # one in between that the gate held back
+    after_one = stamps.estimate(6010)  # one in between that the gate held back
     assert after_one is not None and after_one.sequence == 10
-    assert stamps.reckon(4000) is None  # between two frames
-    assert stamps.reckon(0) is stamps.reckon(90_000) is None  # none, and too far
+    assert stamps.estimate(4000) is None  # between two frames
+    assert stamps.estimate(0) is stamps.estimate(90_000) is None  # none, and too far
     stamps.take(3000, info(9, 10**9 + 90_000_000))  # the camera's clock is another one
-    assert stamps.reckon(6000) is None
+    assert stamps.estimate(6000) is None
     stamps.take(6000, info(0, 10**9 + 123_300_000))  # a session begins
-    assert stamps.reckon(9000) is None
+    assert stamps.estimate(9000) is None
 
 
 @pytest.mark.parametrize("part", ["begin of its slice", "all of it"])

@@ -45,7 +45,7 @@ _CALIBRATION = 0.002
 """Standard deviation of a focal length that somebody calibrated, as a share of it."""
 _FAR = 4.0
 """A focal length that is so many standard deviations off the images' is worth a word. From round to
-round of simulated walks it went to and fro by 0.2 %, one of its own deviations being 0.05 %."""
+round of simulated walks it oscillated by 0.2 %, one of its own deviations being 0.05 %."""
 _EXPLAINED, _SETTLED = 0.1, 0.003
 """A calibrated lens misfits only when another explains the first share of the residuals' variance:
 over six simulated turning flights a focal length off by 1 % left 0.09 to 0.12, by 2 % 0.39 to 0.44.
@@ -208,7 +208,7 @@ class SelfCalibration:
             if is_open and self.rounds >= _OPEN_ROUNDS:
                 return self._give_up(_open(found))
             if self.rounds >= ROUNDS:
-                # It may go to and fro with the points that each model happens to have.
+                # It may oscillate with the points that each model happens to have.
                 if not is_open and not _is_far(found, self.camera):
                     return False
                 return self._give_up(f"after {self.rounds} rounds it has not settled")

@@ -71,7 +71,7 @@ def match(
 
     What `cache` holds is not compared again. Where not every pair is compared, a second round
     tries those that images seen by both bring near each other. `matched` are what `alike` found of
-    pairs, by whatever lens: nine tenths of a comparison. What is found anew is added to it.
+    pairs, by whatever lens: nine tenths of a comparison. What is new is added to it.
     """
     descriptors = Lazily(len(images.names), lambda k: images.features[k].descriptors)
     sequence = choice.sequences(images.names, images.time_ns)

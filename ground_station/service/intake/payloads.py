@@ -132,13 +132,13 @@ class Payload:
         if stream is None or stream is self.stream:
             return False
         with self._lock:
-            anew = self.stream is None or stream.ssrc != self.stream.ssrc
+            new = self.stream is None or stream.ssrc != self.stream.ssrc
             self.stream = stream
-            if anew:
+            if new:
                 self._base = Counters()
                 self._before, self._dropped = None, 0
                 self._samples.clear()
-        return anew
+        return new
 
     def note(
         self, state: PayloadState | None, listener: TelemetryListener, *, encrypted: bool

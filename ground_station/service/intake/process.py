@@ -310,7 +310,7 @@ class Intake:
         unlisted = ", ".join(self._listener.unlisted())
         text = (
             f"{unlisted[:100]} reaches this station and is not on its list: revoked, or made since"
-            " the station's keys were copied here; then copy their folder anew"
+            " the station's keys were copied here; then copy their folder again"
         )
         self._tell(bus_messages.STATION, UNLISTED, text if unlisted else "")
 

@@ -127,14 +127,14 @@ class Snapshot:
         if self._kept is None:
             return
         self._lines += 1
-        anew = self._lines > EVENTS  # the file has twice as many at most
-        text = "".join(json.dumps(one) + "\n" for one in (self._events if anew else (event,)))
+        again = self._lines > EVENTS  # the file has twice as many at most
+        text = "".join(json.dumps(one) + "\n" for one in (self._events if again else (event,)))
         with (
             contextlib.suppress(OSError),  # the run's folder is full
-            self._kept.open("w" if anew else "a") as file,
+            self._kept.open("w" if again else "a") as file,
         ):
             file.write(text)
-        self._lines = 0 if anew else self._lines
+        self._lines = 0 if again else self._lines
 
     # What comes
 
