@@ -24,9 +24,9 @@ class Progress:
         now_s = time.monotonic()
         if now_s - self._said_s >= (_BAR_EVERY_S if self._terminal else _LINE_EVERY_S):
             self._said_s = now_s
-            self._say(now_s - self._start_s)
+            self._write_line(now_s - self._start_s)
 
-    def _say(self, elapsed_s: float) -> None:
+    def _write_line(self, elapsed_s: float) -> None:
         share = self._done / self._total if self._total else 1.0
         rate = self._done / max(elapsed_s, 1e-6)
         rest_s = (self._total - self._done) / rate if rate else 0.0

@@ -11,7 +11,7 @@ from typing import Any
 
 from ground_station.errors import GroundStationError, InputError
 from pi_firmware.wire import files
-from pi_firmware.wire.errors import told
+from pi_firmware.wire.errors import os_errors_as
 
 
 def check_outputs(*paths: str | Path | None, are_folders: bool = False) -> None:
@@ -35,7 +35,7 @@ def check_outputs(*paths: str | Path | None, are_folders: bool = False) -> None:
 def write_bytes(path: str | Path, data: bytes) -> None:
     """Writes a file; raises `GroundStationError` with one line when the disk refuses."""
     path = Path(path)
-    with told(path, GroundStationError):
+    with os_errors_as(path, GroundStationError):
         files.write(path, data)
 
 

@@ -74,7 +74,7 @@ class Progress:
             self._bar.update()
         elif time.monotonic() - self._said_s >= _LINE_EVERY_S:
             self._said_s = time.monotonic()
-            self._say(
+            self._write_line(
                 f"{self._label}: {self._done}" + (f" of {self._total}" if self._total else "")
             )
 
@@ -83,7 +83,7 @@ class Progress:
         """Seconds since the start."""
         return time.monotonic() - self._start_s
 
-    def _say(self, text: str) -> None:
+    def _write_line(self, text: str) -> None:
         if self._silent:
             return
         print(text, file=sys.stderr, flush=True)
@@ -95,4 +95,4 @@ class Progress:
         if self._bar is not None:
             self._bar.close()
         if kind is None:
-            self._say(f"{self._label}: {self._done} in {self.elapsed_s:.1f} s")
+            self._write_line(f"{self._label}: {self._done} in {self.elapsed_s:.1f} s")

@@ -9,19 +9,19 @@ from typing import Any
 
 from hw.quantities import HardwareError
 from pi_firmware.wire import files
-from pi_firmware.wire.errors import told
+from pi_firmware.wire.errors import os_errors_as
 
 
 def make_folder(path: Path) -> None:
     """Makes a folder with those above it; a disk's refusal is a `HardwareError`."""
-    with told(path, HardwareError):
+    with os_errors_as(path, HardwareError):
         path.mkdir(parents=True, exist_ok=True)
 
 
 def write(path: Path, produce: Callable[[Path], object]) -> None:
     """Lets `produce` write beside `path` and renames; a disk's refusal is a `HardwareError`."""
     make_folder(path.parent)
-    with told(path, HardwareError), files.replacing(path) as part:
+    with os_errors_as(path, HardwareError), files.replacing(path) as part:
         produce(part)
 
 

@@ -20,7 +20,7 @@ from hw.inverse import ballast_to_neutral, most_battery, payload_cell, smallest_
 from hw.parts import Part, shipped_parts
 from hw.quantities import HardwareError
 from hw.wiring import GAUGES, drawing
-from pi_firmware.wire.errors import told
+from pi_firmware.wire.errors import os_errors_as
 
 CLIMB_M = 3.0
 
@@ -214,7 +214,7 @@ def drawings() -> dict[Path, str]:
 
 def write_readme() -> list[Path]:
     """Writes tables into the page, and the drawings beside it; raises `HardwareError`."""
-    with told(PAGE, HardwareError):
+    with os_errors_as(PAGE, HardwareError):
         page = PAGE.read_text(encoding="utf-8")
     output.write_text(PAGE, filled(page))
     for path, text in drawings().items():

@@ -75,7 +75,7 @@ class FlightRun(run.Run):
             self._end_earlier(file)
             self._turn()
             file = self._current
-            self._say_what_waited()
+            self._write_held()
         self._restart = self._restart and not idr
         file.unit(unit.info, unit.data, idr=idr)
 
@@ -101,12 +101,12 @@ class FlightRun(run.Run):
         time_ns = item.message.time_ns + self._shift_ns
         if self._is_of_another_clock(time_ns, item.arrived_s):
             if len(self._held) == _HELD:
-                self._say_what_waited()
+                self._write_held()
             self._held.append(item)
         elif self._current.size_bytes <= self._folder.file_limit_bytes + run.OVERRUN_BYTES:
-            self._say(item)
+            self._write_telemetry(item)
 
-    def _say(self, item: Telemetry) -> None:
+    def _write_telemetry(self, item: Telemetry) -> None:
         message, file = item.message, self._current
         time_ns = message.time_ns + self._shift_ns
         if time_ns not in run.TIMES_NS:
@@ -121,11 +121,11 @@ class FlightRun(run.Run):
             return
 
     def _before_end(self) -> None:
-        self._say_what_waited()
+        self._write_held()
 
-    def _say_what_waited(self) -> None:
+    def _write_held(self) -> None:
         while self._held:
-            self._say(self._held.popleft())
+            self._write_telemetry(self._held.popleft())
 
 
 class Recorder(recorder.Recorder):

@@ -216,7 +216,7 @@ class Teller:
         self._failed = False
         self._writes = 0
 
-    def tell(
+    def report(
         self, fault: Fault | None, streams: bool, text: Callable[[], bytes], now_s: float
     ) -> None:
         """`text` makes the file; it is called when there is something to tell and no sooner."""
@@ -320,7 +320,7 @@ def main() -> int:
         view = look(card, service)
         resolve(card)
         fault, streams = judge.fault(view, begun_s)
-        teller.tell(fault, streams, partial(text_of, card, fault, view), begun_s)
+        teller.report(fault, streams, partial(text_of, card, fault, view), begun_s)
         if fault is None:
             (led.heartbeat if streams else led.steady)()
         until_s = begun_s + (CALM_S if teller.told else LOOK_S)

@@ -80,18 +80,18 @@ def provision(card: Card, disk: Disk, owners: Owners, check: Check) -> Outcome:
         held = recover(card, disk)
         outcome = Outcome(IN_FORCE if held else NONE, held.payload_id if held else "")
     except OSError as error:
-        return Outcome(NONE, reason=f"the data partition cannot be written: {_told(error)}")
+        return Outcome(NONE, reason=f"the data partition cannot be written: {_describe(error)}")
     try:
         outcome = _take(card, disk, owners, check, held)
     except (DeployError, OSError) as error:
         with contextlib.suppress(OSError):
             disk.remove(_beside(card)[0])
-        outcome = replace(outcome, state=REFUSED, reason=_told(error))
+        outcome = replace(outcome, state=REFUSED, reason=_describe(error))
     if outcome.payload_id:
         try:
             install(card, disk, owners)
         except (DeployError, OSError) as error:
-            outcome = replace(outcome, warning=f"SSH is not set up: {_told(error)}")
+            outcome = replace(outcome, warning=f"SSH is not set up: {_describe(error)}")
     return replace(outcome, wifi=(card.blimp / RADIO).exists())
 
 
@@ -117,7 +117,7 @@ def _take(card: Card, disk: Disk, owners: Owners, check: Check, held: Record | N
             with writable(card):
                 inputs.shred(card, disk, kept)
         except (DeployError, OSError) as error:
-            warning = f"the secrets are still on the boot partition: {_told(error)}"
+            warning = f"the secrets are still on the boot partition: {_describe(error)}"
     disk.remove(_beside(card)[1])
     return Outcome(IN_FORCE, held.payload_id, fresh=fresh, warning=warning)
 
@@ -154,7 +154,7 @@ def _beside(card: Card) -> tuple[Path, Path]:
     return card.data / "blimp.new", card.data / "blimp.old"
 
 
-def _told(error: BaseException) -> str:
+def _describe(error: BaseException) -> str:
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
         return f"{where}{error.strerror or error}"
@@ -184,7 +184,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         owners = Owners.of_system() if real else Owners()
         outcome = provision(card, Disk(), owners, check)
     except (DeployError, OSError) as error:
-        outcome = Outcome(NONE, reason=_told(error))
+        outcome = Outcome(NONE, reason=_describe(error))
     if outcome.payload_id and real:
         with contextlib.suppress(OSError):
             name = host_name(outcome.payload_id)

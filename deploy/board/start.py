@@ -41,7 +41,7 @@ def _count(path: Path, of: str, before: int) -> bool:
     return True
 
 
-def told(at: Places, chosen: choose.Choice) -> dict[str, str]:
+def release_of(at: Places, chosen: choose.Choice) -> dict[str, str]:
     """What the firmware is told of its release."""
     release = places.read(at.folder(chosen.name) / choose.RELEASE) or {}
     version = chosen.name or str(release.get("version", ""))
@@ -56,7 +56,7 @@ def main(arguments: list[str]) -> int:
     at = Places(root)
     state = choose.read_state(at)
     chosen = choice(at, state)
-    release = told(at, chosen)
+    release = release_of(at, chosen)
     try:
         trial = state.trial["id"] if state.on_trial and state.trial is not None else ""
         running = {**release, "name": chosen.name, "trial": trial}

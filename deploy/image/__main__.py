@@ -68,12 +68,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     started = time.monotonic()
 
-    def say(line: str) -> None:
+    def log(line: str) -> None:
         print(f"image: {time.monotonic() - started:6.1f} s  {line}", file=sys.stderr, flush=True)
 
     try:
         image = options.out or _CHECKOUT / f"out/image/blimp-{options.board}.img"
-        _build(options, image, _epoch(options), say)
+        _build(options, image, _epoch(options), log)
     except DeployError as error:
         print(f"deploy.image: {error}", file=sys.stderr)
         return 2
@@ -86,27 +86,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _build(options: argparse.Namespace, image: Path, epoch: int, say: card.Say) -> None:
+def _build(options: argparse.Namespace, image: Path, epoch: int, log: card.Log) -> None:
     board = with_archives(load_board(options.board), _archives(options))
     if bool(board.base) != (options.base is not None):
         wants = f"needs --base: {board.base}" if board.base else "takes no --base"
         raise DeployError(f"--board {board.name}: {wants}")
     cache_folder = options.cache or _CHECKOUT / "out/cache/image"
-    say("wheels")
+    log("wheels")
     site = fetch_wheels(board, cache_folder)
     if board.base:
-        raspios.build(image, board, options.base, site, cache_folder, _CHECKOUT, epoch, say)
+        raspios.build(image, board, options.base, site, cache_folder, _CHECKOUT, epoch, log)
         return
-    say("kernel")
+    log("kernel")
     kernel = unpack_kernel(board, cache_folder)
-    say("packages (the first time this takes a quarter of an hour)")
+    log("packages (the first time this takes a quarter of an hour)")
     rootfs = build_rootfs(board, cache_folder, _ROOTFS_EPOCH)
 
     def compile_at(folder: Path, at: str) -> None:
         byte_compile(board, rootfs, folder, at, cache_folder)
 
-    card.build(image, board, kernel, rootfs, site, _CHECKOUT, epoch, compile_at, say)
-    say("done")
+    card.build(image, board, kernel, rootfs, site, _CHECKOUT, epoch, compile_at, log)
+    log("done")
 
 
 def _epoch(options: argparse.Namespace) -> int:

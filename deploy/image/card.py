@@ -99,7 +99,7 @@ def boot_contents(
 
 
 DESCRIPTIONS = (".bmap", ".manifest.json", ".sha256")
-Say = Callable[[str], None]
+Log = Callable[[str], None]
 _MIB = 1 << 20
 DATA_BYTES = 64 * _MIB
 # The emulator takes only cards of a power of two; a real one's boot partition has room for the
@@ -133,7 +133,7 @@ def build(
     checkout: Path,
     epoch: int,
     compile: Callable[[Path, str], None] | None = None,
-    say: Say = lambda line: None,
+    log: Log = lambda line: None,
 ) -> None:
     """Builds the image with `.bmap`, `.manifest.json` and `.sha256` beside it.
 
@@ -146,14 +146,14 @@ def build(
         epoch: the time of everything in it that is not older, s since 1970.
         compile: puts byte code beside all Python in a folder, which will lie at a path on the card;
             None: the card compiles at each start.
-        say: takes a line of progress.
+        log: takes a line of progress.
 
     Raises:
         DeployError: an ingredient is missing or broken, something does not fit, a tool fails.
     """
     check_epoch(epoch)
     with building(image) as work:
-        say("reading the packages' root")
+        log("reading the packages' root")
         tree = Tree.from_tar(rootfs)
         modules = f"usr/lib/modules/{kernel.version}"
         if not (kernel.root / modules / "modules.dep").is_file():
@@ -162,10 +162,10 @@ def build(
         firmware = release.build(checkout, site, board.machine, board.python, epoch)
         units = root.customise(tree, checkout, board.name, firmware, epoch)
         if compile is not None:
-            say("byte code of the card's programs")
+            log("byte code of the card's programs")
             root.add_byte_code(tree, compile)
         new = Identifiers(board.name.encode(), tree.digest(epoch))
-        say(f"root: {len(tree)} files, {len(units)} units enabled")
+        log(f"root: {len(tree)} files, {len(units)} units enabled")
         first = initrd.build(tree, kernel.version)
         files = Tree()
         files.take(kernel.boot, _files(kernel.boot))
@@ -173,11 +173,11 @@ def build(
             raise DeployError(f"{kernel.boot}: no kernel '{kernel.image}' in it")
         where = f"UUID={new.uuid('root')}"
         front = boot_contents(board.name, kernel.image, board.machine, files, first, where)
-        say("root partition")
+        log("root partition")
         place = work / "root"
         size = align(ext4.bytes_needed(tree))
         ext4.make(place, size, tree, ROOT_LABEL, new.uuid("root"), epoch)
-        say("boot and data partition, image, block map and checksums")
+        log("boot and data partition, image, block map and checksums")
         packages = packages_of(tree)
         told = Told(board.name, checkout, epoch, packages, site, units)
         finish(work / image.name, front, place, new, told)

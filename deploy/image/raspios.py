@@ -49,7 +49,7 @@ def build(
     cache_folder: Path,
     checkout: Path,
     epoch: int,
-    say: card.Say = lambda line: None,
+    log: card.Log = lambda line: None,
 ) -> None:
     """Builds the image as `card.build` does, but of a `base`.
 
@@ -59,7 +59,7 @@ def build(
     """
     card.check_epoch(epoch)
     with building(image) as work:
-        say(f"taking {base.name} apart")
+        log(f"taking {base.name} apart")
         boot_place, root_place = work / "base-boot", work / "root"
         _take_apart(base, work, boot_place, root_place)
         contents = work / "contents"
@@ -72,7 +72,7 @@ def build(
             tree.put(path, entry)
         digest_of_base = sha256(base)
         if missing:
-            say(f"{len(missing)} packages that the base lacks (emulated, the first time)")
+            log(f"{len(missing)} packages that the base lacks (emulated, the first time)")
             added = add_packages(board, digest_of_base, root_place, before, missing, cache_folder)
             lay_over(tree, Tree.from_tar(added))
         packages = card.packages_of(tree)
@@ -81,14 +81,14 @@ def build(
         ours = tree.changed(before)
         new = Identifiers(board.name.encode(), digest_of_base.encode(), ours.digest(epoch))
         first = initrd.build(tree, _kernel_release(base, tree))
-        say(f"root: {len(ours)} files and folders of ours, {len(units)} units enabled")
+        log(f"root: {len(ours)} files and folders of ours, {len(units)} units enabled")
         _grow(root_place, ours, epoch)
         run(["tune2fs", "-L", card.ROOT_LABEL, root_place], env=ext4.clock(epoch))
         ext4.fill(root_place, tree, epoch, before)
         where = f"UUID={ext4.facts(root_place)['Filesystem UUID']}"
         files = _boot_files(base, boot_place, work / "base-files")
         front = card.boot_contents(board.name, _KERNEL, board.machine, files, first, where)
-        say("boot and data partition, image, block map and checksums")
+        log("boot and data partition, image, block map and checksums")
         told = card.Told(board.name, checkout, epoch, packages, site, units, base)
         card.finish(work / image.name, front, root_place, new, told)
 

@@ -81,7 +81,7 @@ def _update(given: argparse.Namespace) -> int:
     for option, path in (("identity", given.identity), ("site", given.site)):
         if path is not None and not path.exists():
             raise DeployError(f"--{option} {path}: not there")
-    key = bundles.release_key(given.keys, _say)
+    key = bundles.release_key(given.keys, _log)
     card = Card(given.payload, host, key.parents[1], given.identity, given.port)
     state = card.ask("status")
     try:
@@ -90,7 +90,7 @@ def _update(given: argparse.Namespace) -> int:
         limit_s = float(state["limit_s"])
     except (KeyError, TypeError, ValueError):
         raise DeployError(f"{host}: tells its releases otherwise than this checkout") from None
-    _say(f"{given.payload} ({board or 'an unknown board'}) runs {running}")
+    _log(f"{given.payload} ({board or 'an unknown board'}) runs {running}")
     site = given.site or fetch_wheels(load_board(board), _CACHE)
     files = bundles.release_of(CHECKOUT, site, factory.machine, factory.python)
     made = bundles.make(files, key, running if given.allow_older else "")
@@ -100,18 +100,18 @@ def _update(given: argparse.Namespace) -> int:
     with Progress(f"sending {version}", size) as progress:
         answer = card.give(made, held, progress.advance, force=given.force)
     if not answer.get("id"):
-        _say(f"{version} is in force already")
+        _log(f"{version} is in force already")
         return 0
-    _say(f"{version} is on the card and on trial, which ends within {limit_s:g} s")
-    last = card.follow(str(answer["id"]), limit_s, _say)
+    _log(f"{version} is on the card and on trial, which ends within {limit_s:g} s")
+    last = card.follow(str(answer["id"]), limit_s, _log)
     if last.get("outcome") == HEALTHY:
-        _say(f"{version} is in force")
+        _log(f"{version} is in force")
         return 0
-    _say(f"{given.payload} went back to {last['previous'] or factory.version}: {last['reason']}")
+    _log(f"{given.payload} went back to {last['previous'] or factory.version}: {last['reason']}")
     return 1
 
 
-def _say(text: str) -> None:
+def _log(text: str) -> None:
     print(f"update: {text}", file=sys.stderr, flush=True)
 
 

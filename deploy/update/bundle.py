@@ -74,7 +74,7 @@ def make(files: Mapping[str, bytes], key: Path, replaces: str = "") -> Bundle:
     return Bundle(manifest.parse(data), data, sign(data, key), files)
 
 
-def release_key(keys: Path | None, say: Callable[[str], None] = lambda line: None) -> Path:
+def release_key(keys: Path | None, log: Callable[[str], None] = lambda line: None) -> Path:
     """The key that signs, made by `blimp keys` when this authority has none yet."""
     folder = ["--folder", str(keys)] if keys else []
     words = [sys.executable, "-m", "ground_station.cli", "keys", *folder, "release"]
@@ -82,7 +82,7 @@ def release_key(keys: Path | None, say: Callable[[str], None] = lambda line: Non
     if done.returncode != 0:
         raise DeployError((done.stderr.strip() or "blimp keys failed").splitlines()[-1])
     if done.stderr.strip():
-        say(done.stderr.strip().splitlines()[-1])
+        log(done.stderr.strip().splitlines()[-1])
     return Path(done.stdout.strip().splitlines()[-1]).absolute()
 
 

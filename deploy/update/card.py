@@ -142,7 +142,7 @@ class Card:
         self,
         trial: str,
         limit_s: float,
-        say: Callable[[str], None],
+        log: Callable[[str], None],
         sleep: Callable[[float], None] = time.sleep,
         clock: Callable[[], float] = time.monotonic,
     ) -> dict[str, Any]:
@@ -160,7 +160,7 @@ class Card:
             except DeployError as error:
                 if str(error) != fault:
                     fault = str(error)
-                    say(f"not reached, trying on: {fault}")
+                    log(f"not reached, trying on: {fault}")
             else:
                 fault = ""
                 last = found.get("last") or {}

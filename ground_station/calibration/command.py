@@ -156,14 +156,14 @@ def _calibrate(args: argparse.Namespace) -> int:
     gathered = gather(sources, args.inputs, finder, hints)
     for source in sources:
         for note in source.notes:
-            _say(f"note: {note}")
+            _log(f"note: {note}")
     if gathered.interrupted:
-        _say(f"interrupted: calibrating with the {gathered.frames} frames so far")
+        _log(f"interrupted: calibrating with the {gathered.frames} frames so far")
     result = calibrate(gathered, finder, timed, most, args.model or "opencv5")
     results.write_camera(args.out, result, board)
     print(results.table(result, gathered.frames))
     for note in result.notes:
-        _say(f"note: {note}")
+        _log(f"note: {note}")
     if args.json:
         write_json(args.json, results.document(result, board, args.inputs, gathered.frames))
     if args.report:
@@ -214,8 +214,8 @@ class _Hints:
         sharp = [s for s in gathered.observations if s.edge_px <= MAX_EDGE_PX]
         empty = empty_corners(sharp, gathered.size_px)
         left = f"; not yet: {', '.join(empty)}" if empty else "; all corners: Ctrl-C ends it"
-        _say(f"{len(sharp)} sharp views in {gathered.frames} frames{left}")
+        _log(f"{len(sharp)} sharp views in {gathered.frames} frames{left}")
 
 
-def _say(text: str) -> None:
+def _log(text: str) -> None:
     print(f"blimp calibrate: {text}", file=sys.stderr)

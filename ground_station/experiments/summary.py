@@ -70,7 +70,7 @@ def reasons(experiments: Sequence[dict[str, Any]]) -> list[str]:
 
 def _case(case: Case, plan: Plan, store: Store) -> dict[str, Any]:
     found = {
-        preset: [_told(store.read(key), case) for key in keys]
+        preset: [_with_derived(store.read(key), case) for key in keys]
         for preset, keys in plan.runs[case.experiment, case.name].items()
     }
     presets = {preset: aggregate(runs) for preset, runs in found.items()}
@@ -90,7 +90,7 @@ def _case(case: Case, plan: Plan, store: Store) -> dict[str, Any]:
     }
 
 
-def _told(run: dict[str, Any] | None, case: Case) -> dict[str, Any]:
+def _with_derived(run: dict[str, Any] | None, case: Case) -> dict[str, Any]:
     """A run with what is derived from it; or that it was not measured.
 
     `gap_s` is the longest time without a pose, the flight's ends included, and its whole length

@@ -34,7 +34,7 @@ from ground_station.keys import certificates
 from ground_station.keys.certificates import Pair
 from pi_firmware.wire import credentials, files, keys
 from pi_firmware.wire.credentials import GROUND, PAYLOAD
-from pi_firmware.wire.errors import TelemetryError, told
+from pi_firmware.wire.errors import TelemetryError, os_errors_as
 
 SCHEMA = "blimp.authority/1"
 AUTHORITY_DAYS, CERTIFICATE_DAYS = 3650, 730
@@ -336,21 +336,21 @@ def write_private(path: Path, data: bytes, *, replace: bool = False) -> None:
 
     Raises `KeysError` with one line when it exists and `replace` is not set.
     """
-    with told(path, KeysError):
+    with os_errors_as(path, KeysError):
         if path.exists() and not replace:
             raise KeysError(f"{path}: exists already, and keys are never overwritten")
         files.write(path, data, 0o600)
 
 
 def _folder(path: Path) -> Path:
-    with told(path, KeysError):
+    with os_errors_as(path, KeysError):
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
     return path
 
 
 def _move(part: Path, path: Path) -> None:
     _folder(path.parent)
-    with told(path, KeysError):
+    with os_errors_as(path, KeysError):
         files.replace(part, path)
         files.sync(part.parent)
 

@@ -113,17 +113,17 @@ def run(args: argparse.Namespace) -> int:
     source = open_input(args.input, args.rate_hz, parse_range(args.range) if args.range else None)
     map_ = store.load(args.map)
     if not map_.info.registered:
-        _say(f"the map '{map_.info.name}' is not registered: poses are in its own frame and scale")
+        _log(f"the map '{map_.info.name}' is not registered: poses are in its own frame and scale")
     camera = load_camera(args.camera) if args.camera else source.camera or map_.info.camera
     if args.camera or source.camera is None:
         first = look(source)
         camera, said = for_pictures(camera, first.size_px, first.display_deg, str(args.input))
         if said:
-            _say(said)
+            _log(said)
     extractor = extractor_for(map_.info, settings.features)
     localizer = Localizer(map_, camera, extractor, settings, smoothing=bool(args.smoothed))
     if localizer.camera != camera:
-        _say("the map's pictures denied this camera's lens: the one that they found is used")
+        _log("the map's pictures denied this camera's lens: the one that they found is used")
         camera = localizer.camera
     estimates: list[PoseEstimate] = []
     smoothed: list[Kinematics] = []
@@ -137,7 +137,7 @@ def run(args: argparse.Namespace) -> int:
     if not estimates and not interrupted:
         raise InputError(f"{args.input}: no frames in the range {args.range or ':'}")
     for note in source.notes:
-        _say(note)
+        _log(note)
     write_estimates(args.out, estimates)
     if args.smoothed:
         write_smoothed(args.smoothed, smoothed + localizer.finish())
@@ -179,7 +179,7 @@ def _process(
                 nearest = initial.nearest(frame.time_ns)
                 apart_s = abs(int(initial.time_ns[nearest]) - frame.time_ns) / 1e9
                 if apart_s > _FAR_INIT_S:
-                    _say(f"the first pose was taken {apart_s:.2f} s apart from the first frame")
+                    _log(f"the first pose was taken {apart_s:.2f} s apart from the first frame")
                 localizer.set_initial_pose(initial.wTc[nearest], frame.time_ns)
             estimates.append(
                 localizer.process(frame.time_ns, frame.image, frame.index, frame.exposure_s)
@@ -188,5 +188,5 @@ def _process(
             progress.step()
 
 
-def _say(text: str) -> None:
+def _log(text: str) -> None:
     print(f"blimp localize: {text}", file=sys.stderr)

@@ -47,14 +47,14 @@ def run(args: argparse.Namespace) -> int:
     else:
         write_mcap(args.out, poses, args.recording.name)
     if poses.cut_reason:
-        _say(f"{args.recording}: cut ({poses.cut_reason}); what was whole is there")
+        _log(f"{args.recording}: cut ({poses.cut_reason}); what was whole is there")
     if poses.left_out:
-        _say(f"{args.recording}: {poses.left_out} left out: no finite pose or time")
+        _log(f"{args.recording}: {poses.left_out} left out: no finite pose or time")
     if poses.again:
-        _say(f"{args.recording}: the camera's time begins again {poses.again} times")
+        _log(f"{args.recording}: the camera's time begins again {poses.again} times")
     print(f"{len(poses.samples)} poses of {poses.topic} -> {args.out}")
     return 0
 
 
-def _say(text: str) -> None:
+def _log(text: str) -> None:
     print(f"blimp export: {text}", file=sys.stderr)

@@ -12,7 +12,7 @@ from ground_station.arrays import U8
 from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
-from pi_firmware.wire.errors import told
+from pi_firmware.wire.errors import os_errors_as
 
 _MOST_BYTES = 512 << 20
 SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"}
@@ -28,7 +28,7 @@ class ImageFolder:
         self.notes: list[str] = []
         self._rate_hz = rate_hz
         self._range = frame_range
-        with told(path, InputError):
+        with os_errors_as(path, InputError):
             names = sorted(p for p in path.iterdir() if p.suffix.lower() in SUFFIXES)
         if not names:
             raise InputError(f"{path}: no images in this folder (jpg, png, bmp, tif, webp, pgm)")
@@ -61,7 +61,7 @@ class ImageFolder:
 
 def read_grey(path: Path) -> U8:
     """An image file as (H, W) grey, as stored (no turning by EXIF); raises `InputError`."""
-    with told(path, InputError):
+    with os_errors_as(path, InputError):
         if path.exists() and not path.is_file():  # a device may have no end
             raise InputError(f"{path}: not a file")
         with path.open("rb") as file:

@@ -55,18 +55,18 @@ def run(args: argparse.Namespace) -> int:
         load_camera(args.camera), first.size_px, first.display_deg, str(args.input)
     )
     if said:
-        _say(said)
+        _log(said)
     with Progress("import", source.count()) as progress:
         frames = import_frames(source, camera, args.out, name=args.input, step=progress.step)
     for note in source.notes:
-        _say(note)
+        _log(note)
     print(f"{frames} frames of {camera.width_px}x{camera.height_px} -> {args.out}")
     if camera.width_px > _MOST_PX[0] or camera.height_px > _MOST_PX[1]:
         most = "x".join(map(str, _MOST_PX))
-        _say(f"the payload's firmware takes {most} at most: to replay it, import a smaller video")
+        _log(f"the payload's firmware takes {most} at most: to replay it, import a smaller video")
         args.next = f"blimp map build {shlex.quote(str(args.out))} --out maps/NAME"
     return 0
 
 
-def _say(text: str) -> None:
+def _log(text: str) -> None:
     print(f"blimp import: {text}", file=sys.stderr)

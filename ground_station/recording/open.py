@@ -11,7 +11,7 @@ from ground_station.recording.flight import FlightRecording
 from ground_station.recording.folder import ImageFolder
 from ground_station.recording.frames import ALL_FRAMES, FrameRange, FrameSource
 from ground_station.recording.video import AnnexBFile, VideoFile
-from pi_firmware.wire.errors import told
+from pi_firmware.wire.errors import os_errors_as
 from pi_firmware.wire.mcap_records import MAGIC
 
 _ANNEX_B_SUFFIXES = {".h264", ".264", ".avc"}
@@ -32,7 +32,7 @@ def open_input(
         raise InputError(f"the frame rate is {rate_hz} Hz; allowed: 0.001 to 10000 Hz")
     if path.is_dir():
         return ImageFolder(path, rate_hz, wanted)
-    with told(path, InputError), path.open("rb") as file:
+    with os_errors_as(path, InputError), path.open("rb") as file:
         head = file.read(8)
     if not head:
         raise InputError(f"{path}: the file is empty; copy it again from where it was made")

@@ -14,7 +14,7 @@ from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
 from ground_station.recording.h264 import Decoder, grey, parameter_sets_in
-from pi_firmware.wire.errors import told
+from pi_firmware.wire.errors import os_errors_as
 
 _BLOCK_BYTES = 1 << 18
 _REORDERED = 16
@@ -216,7 +216,7 @@ class AnnexBFile:
             yield bytes(packet)
 
     def _blocks(self) -> Iterator[bytes]:
-        with told(self.path, InputError), self.path.open("rb") as file:
+        with os_errors_as(self.path, InputError), self.path.open("rb") as file:
             while block := file.read(_BLOCK_BYTES):
                 yield block
 

@@ -60,12 +60,12 @@ _SAID_EVERY_S = 60.0
 
 
 class RateLimitedLog:
-    """Says a text of each name at most once a minute, through `say(name, text)`."""
+    """Says a text of each name at most once a minute, through `log(name, text)`."""
 
     def __init__(
-        self, say: Callable[[str, str], object], clock: Callable[[], float] = time.monotonic
+        self, log: Callable[[str, str], object], clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._say, self._clock = say, clock
+        self._log, self._clock = log, clock
         self._said_s: dict[str, float] = {}
         self._held: dict[str, int] = {}
 
@@ -78,7 +78,7 @@ class RateLimitedLog:
             return False
         held = self._held.pop(name, 0)
         self._said_s[name] = now_s
-        self._say(name, f"{text} ({held} more since the last line)" if held else text)
+        self._log(name, f"{text} ({held} more since the last line)" if held else text)
         return True
 
 

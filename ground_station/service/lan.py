@@ -112,11 +112,11 @@ def joined(settings: StationSettings, stations: Sequence[str]) -> StationSetting
 def announced(settings: StationSettings, interface: str) -> StationSettings:
     """The settings that `on` makes, told to who started the command."""
     heard = on(settings, interface)
-    print(told(heard), flush=True)
+    print(summary(heard), flush=True)
     return heard
 
 
-def told(settings: StationSettings) -> str:
+def summary(settings: StationSettings) -> str:
     """What a person must know of it, in lines: where it listens, and what a payload needs."""
     telemetry = settings.telemetry
     held = credentials.load(telemetry.certificates)

@@ -149,7 +149,7 @@ class Urgency:
         """Whether a report must not wait."""
         return self._was_urgent or _is_urgent(flow)
 
-    def told(self, report: messages.LinkReport, now_s: float) -> None:
+    def reported(self, report: messages.LinkReport, now_s: float) -> None:
         """This report went out; a wish for an IDR is none of the link."""
         if not report.wants_idr:
             self._told_s, self._was_urgent = now_s, _is_urgent(report)
@@ -307,7 +307,7 @@ class Feedback:
                 keys.key(payload_id, keys.LINK), congestion_control=zenoh.CongestionControl.DROP
             )
         self._publishers[payload_id].put(messages.encode(report))
-        self._urgencies.setdefault(payload_id, Urgency()).told(report, time.monotonic())
+        self._urgencies.setdefault(payload_id, Urgency()).reported(report, time.monotonic())
 
 
 def _is_anothers(ssrc: int, state: PayloadState | None) -> bool:

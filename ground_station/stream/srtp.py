@@ -21,7 +21,7 @@ from ground_station.stream.counters import Counters
 from ground_station.stream.rtp import MAX_JUMP
 from pi_firmware.wire import keys as names
 from pi_firmware.wire import video
-from pi_firmware.wire.errors import StreamError, TelemetryError, told
+from pi_firmware.wire.errors import StreamError, TelemetryError, os_errors_as
 from pi_firmware.wire.srtcp import SRTP_LABEL, SessionKeys
 from pi_firmware.wire.srtp import TAG_BYTES, read_key
 
@@ -49,7 +49,7 @@ def load_keys(folder: str | Path) -> dict[str, bytes]:
     It reads `FOLDER/srtp/ID.key` as `blimp keys` wrote them; raises `StreamError` with one line.
     """
     folder = Path(folder) / FOLDER
-    with told(folder, StreamError):
+    with os_errors_as(folder, StreamError):
         paths = sorted(path for path in folder.iterdir() if path.suffix == ".key")
     loaded = {}
     for path in paths:

@@ -7,7 +7,7 @@ import socket
 import struct
 import time
 
-from pi_firmware.wire.errors import StreamError, told
+from pi_firmware.wire.errors import StreamError, os_errors_as
 
 BUFFER_BYTES = 4 << 20
 """What the receiver asks for: a second of video that a busy machine leaves waiting."""
@@ -25,7 +25,7 @@ def bind(host: str, port: int, poll_s: float) -> socket.socket:
 
     Raises `StreamError` with one line.
     """
-    with told(f"video on {host} port {port}", StreamError):
+    with os_errors_as(f"video on {host} port {port}", StreamError):
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         receiver = socket.socket(family, socket.SOCK_DGRAM)
         try:

@@ -163,7 +163,7 @@ class _Run:
         for name, extractor in others.items():
             figures = figures_of(extractor, self.held)
             self.log.add("baseline", step=step, name=name, **asdict(figures))
-            _say(name, figures)
+            _log(name, figures)
 
     def go(self, source: Source, step: int) -> dict[str, Any]:
         """The steps that are left; an interrupt ends them after a checkpoint."""
@@ -225,7 +225,7 @@ class _Run:
         self.compare(network)
         extractor = BlobFeatures(network, _MOST_POINTS, LearnedSettings())
         figures = figures_of(extractor, self.held)
-        _say(f"step {step}", figures)
+        _log(f"step {step}", figures)
         values = asdict(figures)
         self.log.add("validation", step=step, **values, seconds=round(self.seconds, 1))
         curve.plot(self.log.path, self.out / "curve.png")
@@ -281,7 +281,7 @@ def figures_of(extractor: Extractor, pairs: Batch) -> Figures:
     )
 
 
-def _say(name: str, figures: Figures) -> None:
+def _log(name: str, figures: Figures) -> None:
     print(
         f"{name}: {100 * figures.accuracy:.1f} % of matches within 3 px ({figures.correct:.0f} a "
         f"pair), repeatability {100 * figures.repeatability:.1f} %, {figures.error_px:.2f} px",

@@ -158,7 +158,7 @@ class SerialAutopilot(Autopilot):
             while not self._end.is_set() and time.monotonic() < until_s:
                 with contextlib.suppress(Exception):
                     self._judge_waiting()
-                    self._tell()
+                    self._publish_state()
                 self._end.wait(_TICK_S)
 
     def _talk(self, port: Any) -> None:
@@ -177,7 +177,7 @@ class SerialAutopilot(Autopilot):
             if estimate is not None:
                 self._write(port, estimate)
                 self._sent += 1
-            self._tell()
+            self._publish_state()
 
     def _write(self, port: Any, message: Any) -> None:
         port.write(message.pack(self._coder))
@@ -248,7 +248,7 @@ class SerialAutopilot(Autopilot):
             "battery_percentage": remaining / 100 if 0 <= remaining <= 100 else None,
         }
 
-    def _tell(self) -> None:
+    def _publish_state(self) -> None:
         now_s = time.monotonic()
         if now_s >= self._next_state_s:
             self._next_state_s = now_s + self._settings.period_s

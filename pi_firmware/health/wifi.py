@@ -164,7 +164,7 @@ class Wifi:
         self._failing.discard("restart")
         count = self._state.restarts + 1
         self._state = WifiState(name, restarts=count)
-        self._tell(
+        self._try_announce(
             messages.EVENT_RADIO_RESTARTED,
             f"{name} was restarted, the ground was silent for {silent_s:.0f} s (restart {count})",
         )
@@ -218,8 +218,8 @@ class Wifi:
     def _failed(self, what: str, reason: str) -> None:
         if what not in self._failing:
             self._failing.add(what)
-            self._tell(messages.EVENT_RADIO_FAILED, f"{what}: {reason}")
+            self._try_announce(messages.EVENT_RADIO_FAILED, f"{what}: {reason}")
 
-    def _tell(self, name: str, text: str) -> None:
+    def _try_announce(self, name: str, text: str) -> None:
         with contextlib.suppress(Exception):  # a link that fails is why we are here
             self._announce(name, text)

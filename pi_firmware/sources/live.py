@@ -130,12 +130,12 @@ class LiveSource(Source):
 
     def stamp(self, running_ns: int) -> Stamp:
         self._stamped += 1
-        exposure_s, gain = self.told()
+        exposure_s, gain = self.exposure_and_gain()
         marked_ns = wall_at(self._pipeline, running_ns)
         captured_ns = marked_ns + to_middle_ns(self._mark, exposure_s, self._readout_s)
         return Stamp(captured_ns, captured_ns, exposure_s, gain)
 
-    def told(self) -> tuple[float | None, float | None]:
+    def exposure_and_gain(self) -> tuple[float | None, float | None]:
         """Exposure, s, and gain of the frame at hand; None where the device does not tell."""
         return None, None
 

@@ -44,7 +44,7 @@ class SourceError(BlimpError):
 
 
 @contextlib.contextmanager
-def told(what: object, kind: type[BlimpError]) -> Iterator[None]:
+def os_errors_as(what: object, kind: type[BlimpError]) -> Iterator[None]:
     """A disk's refusal as an error of that kind, whose line begins with `what`."""
     try:
         yield

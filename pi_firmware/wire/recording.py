@@ -26,7 +26,7 @@ from mcap.records import Message as McapMessage
 from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
-from pi_firmware.wire.errors import RecordingError, told
+from pi_firmware.wire.errors import RecordingError, os_errors_as
 from pi_firmware.wire.mcap_records import CUT, MAGIC, PARSE_ERRORS, Clamped, Damage, records
 
 M = TypeVar("M", bound=Message)
@@ -87,7 +87,7 @@ class RecordingWriter:
         open_file: Callable[[Path], IO[bytes]] | None = None,
     ) -> None:
         self.path = Path(path)
-        with told(self.path, RecordingError):
+        with os_errors_as(self.path, RecordingError):
             self._file = (open_file or (lambda p: p.open("wb")))(self.path)
         # H.264 does not compress further; JSON and poses are small beside it.
         self._writer = Writer(
@@ -96,7 +96,7 @@ class RecordingWriter:
             compression=CompressionType.NONE,
             use_summary_offsets=False,  # it tells of groups that it has not
         )
-        with told(self.path, RecordingError):
+        with os_errors_as(self.path, RecordingError):
             self._writer.start(library="blimp")
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
@@ -113,7 +113,7 @@ class RecordingWriter:
         """Writes index and footer; a second call does nothing."""
         if not self._closed:
             self._closed = True
-            with told(self.path, RecordingError), self._file:
+            with os_errors_as(self.path, RecordingError), self._file:
                 self._writer.finish()
 
     def flush(self) -> None:
@@ -121,7 +121,7 @@ class RecordingWriter:
 
         It does not wait for the disk.
         """
-        with told(self.path, RecordingError):
+        with os_errors_as(self.path, RecordingError):
             self._writer.flush()
 
     def write_video(
@@ -208,7 +208,7 @@ class RecordingWriter:
 
     def write_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Adds a named table of strings about the recording: seed, scene, program version."""
-        with told(self.path, RecordingError):
+        with os_errors_as(self.path, RecordingError):
             self._writer.add_metadata(name, dict(values))
 
     def write_protobuf(self, topic: str, time_ns: int, message: Message) -> None:
@@ -229,7 +229,7 @@ class RecordingWriter:
         self._sequence[topic] = sequence + 1
         if not 0 <= time_ns < 1 << 63:
             raise RecordingError(f"{self.path}: the time {time_ns} ns is not between 0 and 2^63")
-        with told(self.path, RecordingError):
+        with os_errors_as(self.path, RecordingError):
             self._writer.add_message(
                 self._channels[topic],
                 log_time=time_ns,
@@ -260,7 +260,7 @@ class RecordingReader:
         self.cut = False
         self.cut_reason = ""
         self.metadata: dict[str, dict[str, str]] = {}
-        with told(self.path, RecordingError), self.path.open("rb") as file:
+        with os_errors_as(self.path, RecordingError), self.path.open("rb") as file:
             magic = file.read(8)
         if magic != MAGIC:
             raise RecordingError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pi_firmware.wire.errors import StreamError, told
+from pi_firmware.wire.errors import StreamError, os_errors_as
 
 CIPHER, AUTHENTICATION = "aes-128-icm", "hmac-sha1-80"
 """AES_CM_128_HMAC_SHA1_80 (RFC 3711, 8.2), as GStreamer's `srtpenc` names its parts."""
@@ -27,7 +27,7 @@ def read_key(path: Path) -> bytes:
 
     Raises `StreamError` with one line, which never shows what the file holds.
     """
-    with told(path, StreamError), path.open("rb") as file:
+    with os_errors_as(path, StreamError), path.open("rb") as file:
         text = file.read(_FILE_LIMIT)
     try:
         key = bytes.fromhex(text.decode("ascii").strip())

@@ -83,7 +83,7 @@ class Station:
 
     def tell(self, *wants: str, alarms: Sequence[Alarm] = ()) -> None:
         """As its page does four times a second."""
-        self.fleet.tell(list(alarms), frozenset(wants), 0.5)
+        self.fleet.publish_state(list(alarms), frozenset(wants), 0.5)
 
     def others(self) -> list[str]:
         return [other["name"] for other in self.fleet.document()["stations"]]

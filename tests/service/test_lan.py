@@ -71,9 +71,9 @@ def test_it_is_the_block_of_station_toml(data: Path) -> None:
 def test_it_tells_what_a_payload_needs(data: Path) -> None:
     authority = Authority.create(data)
     authority.add("ground", "main")
-    assert "hears nobody yet: blimp keys payload" in lan.told(lan.on(StationSettings(), "wlan0"))
+    assert "hears nobody yet: blimp keys payload" in lan.summary(lan.on(StationSettings(), "wlan0"))
     authority.add("payload", "blimp-7")
-    said = lan.told(lan.on(StationSettings(), "wlan0"))
+    said = lan.summary(lan.on(StationSettings(), "wlan0"))
     for words in ("hears the payloads: blimp-7", "PAYLOAD=blimp-7", "video udp 5600 (SRTP)"):
         assert words in said
 

@@ -301,7 +301,7 @@ def test_an_outbox_is_bounded_and_keeps_the_newest():
     async def main():
         outbox = Outbox()
         for number in range(10_000):
-            outbox.tell(f"text {number}")
+            outbox.queue(f"text {number}")
             outbox.replace(f"slot {number}", str(number))
             outbox.replace("slot 3", f"newest {number}")
             outbox.show(bytes([number % 256]))

@@ -79,7 +79,7 @@ def fly(
             now_ns = round(looked_s * 1e9)
             if is_due or (urgency.wants_look(looked_s) and urgency.is_due(arrivals.flow(now_ns))):
                 report = _report(arrivals, now_ns, lost_of_late)
-                urgency.told(report, looked_s)
+                urgency.reported(report, looked_s)
                 flown.reports.append((looked_s, report))
                 told.append((looked_s + delay_s, report))
             while told and told[0][0] <= looked_s:

@@ -74,12 +74,12 @@ def choose(state: State, fault: Callable[[str], str]) -> Choice:
             break
         wrong = fault(name)
         if not wrong:
-            return _told(name, reason, state.last)
+            return _choice_of(name, reason, state.last)
         reason = reason or f"{name}: {wrong}"
-    return _told(FACTORY, reason, state.last)
+    return _choice_of(FACTORY, reason, state.last)
 
 
-def _told(name: str, reason: str, last: dict[str, Any] | None) -> Choice:
+def _choice_of(name: str, reason: str, last: dict[str, Any] | None) -> Choice:
     """An update that failed is told until another one is in force."""
     if not reason and last is not None and last["outcome"] == FELL_BACK:
         reason = last["reason"] if last["previous"] == name else ""

@@ -56,7 +56,7 @@ def decide(
 def watch(
     at: Places,
     service: Service,
-    say: Callable[[str], None],
+    log: Callable[[str], None],
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
     """Watches the trial that is under way to its end; without one it does nothing."""
@@ -71,7 +71,7 @@ def watch(
             trial |= {"boot_id": boot_id or "unknown", "started_s": now_s}
             places.write(at.trial, trial)
         before = trial["previous"] or "the image's"
-        say(f"{trial['release']} is on trial, after {before}")
+        log(f"{trial['release']} is on trial, after {before}")
         # A board that comes back from a power cut starts the firmware itself.
         if first:
             service.restart()
@@ -90,7 +90,7 @@ def watch(
             if outcome:
                 break
             sleep(_LOOK_S)
-        say(f"{trial['release']}: {outcome}{f': {reason}' if reason else ''}")
+        log(f"{trial['release']}: {outcome}{f': {reason}' if reason else ''}")
         shelf.finish(at, service if outcome == FELL_BACK else None, trial, outcome, reason)
 
 

@@ -173,7 +173,7 @@ class Cache:
             found = decode(entry)
         except EntryError as error:
             if not self.figures.damaged:
-                _say(f"cache: an entry of {self._path} is damaged ({error}) and is made again")
+                _log(f"cache: an entry of {self._path} is damaged ({error}) and is made again")
             self.figures.damaged += 1
             return None
         self._used.add(key)
@@ -285,11 +285,11 @@ class Cache:
         self._path.replace(aside)
         for ending in ("-wal", "-shm"):
             self._path.with_name(self._path.name + ending).unlink(missing_ok=True)
-        _say(f"cache: {self._path} is damaged; it is kept as {aside.name} and begun again")
+        _log(f"cache: {self._path} is damaged; it is kept as {aside.name} and begun again")
 
     def _stop(self, error: OSError | sqlite3.Error) -> None:
         reason = error.strerror if isinstance(error, OSError) else error
-        _say(f"cache: {self._path}: {reason or error}; the build goes on without it")
+        _log(f"cache: {self._path}: {reason or error}; the build goes on without it")
         self._pending.clear()
         self._used.clear()
 
@@ -334,5 +334,5 @@ def _digest(key: bytes, entry: Entry) -> bytes:
     return hashlib.blake2b(key + head + entry.data, digest_size=16).digest()
 
 
-def _say(text: str) -> None:
+def _log(text: str) -> None:
     print(text, file=sys.stderr, flush=True)

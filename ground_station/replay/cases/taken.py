@@ -63,7 +63,7 @@ def outcome_of(
         refused=live.payload.refused,
         payload_side=dataclasses.asdict(payload_side or Side()),
         ground_side=dataclasses.asdict(result.ground_side),
-        versions=versions() | _told(health),
+        versions=versions() | _firmware_version(health),
         settings={
             "replay": _plain(dataclasses.asdict(settings), without=("recording", "pictures")),
             "localizer": dataclasses.asdict(result.localizer),
@@ -92,7 +92,7 @@ def _document(message: messages.Message | None) -> dict[str, Any] | None:
     return None if message is None else dataclasses.asdict(message)
 
 
-def _told(health: messages.Health | None) -> dict[str, str]:
+def _firmware_version(health: messages.Health | None) -> dict[str, str]:
     if health is None or not health.version:
         return {}
     how = f" ({health.release})" if health.release else ""

@@ -92,7 +92,7 @@ class Fleet:
         self._bus, self._version, self._on_picture = bus, version, on_picture
         self._own_maps = OwnMaps(settings.map)
         self._shelf = Path(settings.map.shelf)
-        self.where = Whereabouts(self._own_maps.told())
+        self.where = Whereabouts(self._own_maps.messages())
         """Who flies where, for the page."""
         self._fetching = threading.Lock()
         self._lock = threading.Lock()
@@ -161,7 +161,9 @@ class Fleet:
         if not station:
             answer = self._bus.query(name, request, timeout_s=timeout_s)
             if payload_id:
-                self._say(payload_id, f"{_what(request)} was asked for at station '{self.name}'")
+                self._publish_event(
+                    payload_id, f"{_what(request)} was asked for at station '{self.name}'"
+                )
             return answer
         with contextlib.suppress(ValueError):
             answer = json.loads(self._ask(station, name, request, timeout_s))
@@ -186,7 +188,7 @@ class Fleet:
 
     # What this station's page adds
 
-    def tell(self, alarms: list[Alarm], wants: frozenset[str], cpu: float) -> None:
+    def publish_state(self, alarms: list[Alarm], wants: frozenset[str], cpu: float) -> None:
         """Tells the others how this station is; to be called at least twice a second.
 
         `cpu` are the cores that its processes use.
@@ -208,7 +210,7 @@ class Fleet:
             leaves = self._allocation.leaves(here.keys() - alone, alone, load, overloaded, peers)
             pins = dict(self._allocation.pins)
         self._leave(leaves)
-        maps = self._own_maps.told()
+        maps = self._own_maps.messages()
         self.where.maps = maps
         self._watch({f"{ROOT}/{at}/{_PICTURE}/{name}" for name, at in away.items() if at})
         said = StationMessage(
@@ -232,11 +234,11 @@ class Fleet:
         with self._lock:
             self._allocation.pin(payload_id, Pin(station, time.time_ns()))
         where = f"to fly with station '{station}'" if station else "to fly where there is room"
-        self._say(payload_id, f"it was asked {where}, at station '{self.name}'")
+        self._publish_event(payload_id, f"it was asked {where}, at station '{self.name}'")
 
     def _leave(self, leaves: Mapping[str, str]) -> None:
         for name in leaves.keys() - self._left.keys():
-            self._say(name, f"left to another station: {leaves[name]}", name="left")
+            self._publish_event(name, f"left to another station: {leaves[name]}", name="left")
         if leaves or self._left:
             note = LeaveMessage(sorted(leaves))
             self._bus.publish(bus_messages.LEAVE, bus_messages.STATION, note)
@@ -271,7 +273,7 @@ class Fleet:
         if not answer.get("done"):
             level = bus_messages.ALARM
             text = f"it was recorded as {before}; here: {answer.get('reason')}"
-        self._say(payload_id, text, level, "recording-moved")
+        self._publish_event(payload_id, text, level, "recording-moved")
 
     def _own_estimate(self, payload_id: str, note: EstimateMessage) -> None:
         if note.overload:
@@ -379,11 +381,11 @@ class Fleet:
                 return
             if payload_id:
                 answer = self._bus.query(name, request, timeout_s=TIMEOUT_S)
-                self._say(payload_id, f"{_what(request)} was asked for at station '{by}'")
+                self._publish_event(payload_id, f"{_what(request)} was asked for at station '{by}'")
         with contextlib.suppress(Exception):  # whoever asked may be gone
             query.reply(query.key_expr, json.dumps(answer).encode())
 
-    def _say(
+    def _publish_event(
         self, payload_id: str, text: str, level: Level = bus_messages.INFO, name: str = _ASKED
     ) -> None:
         note = EventMessage(time.time_ns(), "web", level, name, text)

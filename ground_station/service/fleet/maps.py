@@ -84,7 +84,7 @@ class OwnMaps:
         self._own, self._shelf = Path(settings.folder).resolve(), Path(settings.shelf)
         self._read: dict[Path, tuple[int, MapMessage]] = {}
 
-    def told(self) -> list[MapMessage]:
+    def messages(self) -> list[MapMessage]:
         """What is told of them, the station's own first."""
         grown: list[Path] = []
         with contextlib.suppress(OSError):

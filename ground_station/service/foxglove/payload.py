@@ -54,7 +54,7 @@ class Topic:
         """Whether anyone listens."""
         return bool(self._channel.has_sinks())
 
-    def say(self, make: Make, log_ns: int, client: int | None = None) -> None:
+    def publish(self, make: Make, log_ns: int, client: int | None = None) -> None:
         """Sends what `make` gives, a message or a JSON object, to all or to one client."""
         if not self.wanted:
             return
@@ -70,7 +70,7 @@ class Topic:
     def greet(self, client: int) -> None:
         """Tells a new subscriber what was said before it came and still holds."""
         for make, log_ns in self._kept() if self._kept else ():
-            self.say(make, log_ns, client)
+            self.publish(make, log_ns, client)
 
 
 def json_topic(
@@ -150,7 +150,7 @@ class Payload:
         if size != self._size:
             self._size = size
             for make, log_ns in self._calibrated():
-                self._calibration.say(make, log_ns)
+                self._calibration.publish(make, log_ns)
         now_s = time.monotonic()
         if not self._image.wanted or now_s < self._due_s - _EARLY * self._period_s:
             return
@@ -159,7 +159,7 @@ class Payload:
             return
         self._due_s = max(self._due_s, now_s - self._period_s) + self._period_s
         time_ns = conversion.stamp_ns(note)
-        self._image.say(lambda: self._encoded(image, time_ns), time_ns)
+        self._image.publish(lambda: self._encoded(image, time_ns), time_ns)
 
     def estimate(self, note: EstimateMessage) -> None:
         """A frame's pose, or why there is none."""
@@ -169,18 +169,18 @@ class Payload:
             begins = not self._was_solved or note.relocalized
             self._trail.add(time_ns, pose.position_m, begins=begins)
             self._last = (pose, time_ns)
-            self._pose.say(lambda: drawing.pose_in_map(pose, time_ns), time_ns)
-            self._tf.say(lambda: drawing.transforms(self._id, pose, time_ns), time_ns)
+            self._pose.publish(lambda: drawing.pose_in_map(pose, time_ns), time_ns)
+            self._tf.publish(lambda: drawing.transforms(self._id, pose, time_ns), time_ns)
         self._was_solved = pose is not None
-        self._estimate.say(lambda: documents.estimate(self._id, note, pose), time_ns)
+        self._estimate.publish(lambda: documents.estimate(self._id, note, pose), time_ns)
         points = list(zip(note.points_px[::2], note.points_px[1::2], strict=True))
-        self._points.say(lambda: drawing.tracked(points, time_ns), time_ns)
+        self._points.publish(lambda: drawing.tracked(points, time_ns), time_ns)
         if self._last is not None:
-            self._scene.say(lambda: self._marker(time_ns), time_ns)
+            self._scene.publish(lambda: self._marker(time_ns), time_ns)
             now_s = time.monotonic()
             if now_s - self._trail_s >= _TRAIL_PERIOD_S:
                 self._trail_s = now_s
-                self._scene.say(lambda: self._line(time_ns), time_ns)
+                self._scene.publish(lambda: self._line(time_ns), time_ns)
 
     def see(self, note: EstimateMessage, others: Mapping[str, EstimateMessage]) -> None:
         """Where the others are at the time of its pose, at most five times a second."""
@@ -189,7 +189,7 @@ class Payload:
             return
         self._seen_s = now_s
         time_ns = conversion.stamp_ns(note)
-        self._neighbours.say(
+        self._neighbours.publish(
             lambda: documents.neighbours(self._id, time_ns, neighbours(self._id, note, others)),
             time_ns,
         )
@@ -204,9 +204,9 @@ class Payload:
             if document is not None and document != self._told.get(name, ({}, 0))[0]:
                 self._told[name] = (document, now_ns)
                 for make, log_ns in self._recall(name):
-                    self._messages[name].say(make, log_ns)
+                    self._messages[name].publish(make, log_ns)
         if self.alive and not note.alive:
-            self._scene.say(lambda: drawing.gone(now_ns), now_ns)
+            self._scene.publish(lambda: drawing.gone(now_ns), now_ns)
             self._was_solved = False
         self.alive = note.alive
 

@@ -44,22 +44,22 @@ _LENGTH = 200
 class RateLimitedHandler(logging.Handler):
     """Passes on one record of each logger a minute, with how many there were; warnings and up."""
 
-    def __init__(self, say: RateLimitedLog) -> None:
+    def __init__(self, log: RateLimitedLog) -> None:
         super().__init__(logging.WARNING)
-        self._say = say
+        self._log_limited = log
 
     def emit(self, record: logging.LogRecord) -> None:
         """Takes a record, under the handler's lock."""
         try:
-            self._say(record.name, record.getMessage()[:_LENGTH])
+            self._log_limited(record.name, record.getMessage()[:_LENGTH])
         except Exception:
             self.handleError(record)
 
 
-def install(say: RateLimitedLog) -> None:
+def install(log: RateLimitedLog) -> None:
     """Puts it in place of what Python would print."""
     logger = logging.getLogger("foxglove")
-    logger.addHandler(RateLimitedHandler(say))
+    logger.addHandler(RateLimitedHandler(log))
     logger.propagate = False
 
 
@@ -203,13 +203,13 @@ class Publishing(ServerListener):
 
     def _take_event(self, payload_id: str, note: EventMessage) -> None:
         self._events.append((payload_id, note))
-        self._event.say(lambda: documents.event(payload_id, note), note.time_ns)
-        self._log.say(lambda: drawing.log(payload_id, note), note.time_ns)
+        self._event.publish(lambda: documents.event(payload_id, note), note.time_ns)
+        self._log.publish(lambda: drawing.log(payload_id, note), note.time_ns)
 
     def _take_recording(self, _: str, note: RecordingMessage) -> None:
         self._recording = (note, time.time_ns())
         for make, log_ns in self._recalled():
-            self._recorded.say(make, log_ns)
+            self._recorded.publish(make, log_ns)
 
     def _payload(self, payload_id: str) -> Payload | None:
         known = self._payloads.get(payload_id)
@@ -289,9 +289,9 @@ class Publishing(ServerListener):
             return
         plan = read.plan
         if plan is not None and channel in (None, self._plan.id):
-            self._plan.say(lambda: world.grid(plan, now_ns), now_ns, client)
+            self._plan.publish(lambda: world.grid(plan, now_ns), now_ns, client)
         if channel in (None, self._landmarks.id):
-            self._landmarks.say(lambda: world.cloud(read.landmarks, now_ns), now_ns, client)
+            self._landmarks.publish(lambda: world.cloud(read.landmarks, now_ns), now_ns, client)
 
 
 def _listen(settings: StationSettings, context: Context, listener: Publishing) -> Any:

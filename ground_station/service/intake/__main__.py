@@ -38,7 +38,7 @@ def serve(run_folder: str) -> int:
         bus.subscribe(bus_messages.EVENT, EventMessage, intake.heard_event)
         bus.subscribe(bus_messages.LEAVE, LeaveMessage, intake.leave)
         # A disk that hangs, or is full, does not hold up the video.
-        about = (intake.recorder, settings.recording, intake.say)
+        about = (intake.recorder, settings.recording, intake.report)
         threading.Thread(target=resuming.begin, args=about, daemon=True).start()
         while not stop.wait(_STEP_S):
             intake.step()

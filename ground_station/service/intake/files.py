@@ -122,7 +122,7 @@ class GroundRun(run.Run):
         if isinstance(item, Said):
             if item.account is not None:
                 self._count(*item.account)
-            self._say(item.topic, item.schema, item.log_ns, item.text)
+            self._write_message(item.topic, item.schema, item.log_ns, item.text)
         elif isinstance(item, Estimated):
             # Numbers that are none are a localizer's error, and no reason to end a recording.
             with contextlib.suppress(TypeError, ValueError, KeyError):
@@ -215,7 +215,7 @@ class GroundRun(run.Run):
         del document["points_px"]  # they would be more than the video
         text = json.dumps(document, separators=(",", ":")).encode()
         topic = stream.prefix + ESTIMATE_STATE_TOPIC
-        self._say(topic, "blimp.estimate", item.log_ns, text)
+        self._write_message(topic, "blimp.estimate", item.log_ns, text)
 
     def _in_map(self, payload_id: str, name: str) -> None:
         """Says, in this file and all that follow, in which map a payload is localized now."""
@@ -226,7 +226,7 @@ class GroundRun(run.Run):
                 self._head[MAP_TABLE + one] = {"name": one}
                 self._current.writer.write_metadata(MAP_TABLE + one, {"name": one})
 
-    def _say(self, topic: str, schema: str, log_ns: int, text: bytes) -> None:
+    def _write_message(self, topic: str, schema: str, log_ns: int, text: bytes) -> None:
         if log_ns in run.TIMES_NS:
             self._current.writer.write_json_text(topic, log_ns, text, schema_name=schema)
             self._current.added(len(text))

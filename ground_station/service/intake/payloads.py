@@ -22,7 +22,7 @@ from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware.wire import messages
 from pi_firmware.wire.clock_offset import Offset
 
-Say = Callable[[str, str, Message], None]
+Publish = Callable[[str, str, Message], None]
 
 _WINDOW_S = 2.0
 _FRESH_S = 3.0
@@ -37,7 +37,7 @@ class Payload:
     """One payload that is taken up. `take` is called on its stream's thread, `note` on another."""
 
     def __init__(
-        self, payload_id: str, folder: Path | None, say: Say, recorder: GroundRecorder
+        self, payload_id: str, folder: Path | None, publish: Publish, recorder: GroundRecorder
     ) -> None:
         self.id = payload_id
         self.alive = False
@@ -49,7 +49,7 @@ class Payload:
         self.clock: Callable[[], Offset | None] = lambda: None
         self.started_ns = 0
         """When a session starts, by the payload's own clock: its word may be heard after frames."""
-        self._say, self._recorder = say, recorder
+        self._publish, self._recorder = publish, recorder
         self._pictures = PictureWriter(folder, payload_id) if folder is not None else None
         self._lock = threading.Lock()  # two streams overlap for a moment when it restarts
         self._frame_s, self._clock_ns = float("-inf"), 0
@@ -120,7 +120,7 @@ class Payload:
             damaged=packed(frame.damaged),
             **vars(frame.info),
         )
-        self._say(bus_messages.FRAME, self.id, note)
+        self._publish(bus_messages.FRAME, self.id, note)
 
     @property
     def streaming(self) -> bool:

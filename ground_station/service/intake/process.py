@@ -25,7 +25,7 @@ from ground_station.service.bus_messages import (
 )
 from ground_station.service.ending import CannotGoOn
 from ground_station.service.intake import poses
-from ground_station.service.intake.payloads import Payload, Say
+from ground_station.service.intake.payloads import Payload, Publish
 from ground_station.service.intake.recording import GroundRecorder
 from ground_station.service.intake.roster import NAMELESS, Announced, Roster
 from ground_station.service.settings import StationSettings
@@ -69,21 +69,21 @@ _LEVELS: dict[str, Level] = {
 class Intake:
     """Takes up payloads from its start until `close`; `step` it several times a second.
 
-    `say` tells all processes, `folder` is where pictures go (None: none are shown). `stepped` is
-    for payloads that wait for poses: they are told the newest again at each step. Raises a
+    `publish` reaches all processes, `folder` is where pictures go (None: none are shown). `stepped`
+    is for payloads that wait for poses: they are told the newest again at each step. Raises a
     `BlimpError` with one line when a port is in use or a folder of certificates is not one.
     """
 
     def __init__(
         self,
         settings: StationSettings,
-        say: Say,
+        publish: Publish,
         *,
         folder: Path | None = None,
         camera: Camera | None = None,
         stepped: bool = False,
     ) -> None:
-        self._say_note, self._folder, self._stepped = say, folder, stepped
+        self._publish_message, self._folder, self._stepped = publish, folder, stepped
         self._announced = Announced()
         self._roster = Roster(settings.payloads, self._announced, self._make)
         self._told: dict[str, str] = {}
@@ -94,7 +94,7 @@ class Intake:
         self._due_s = {"payloads": 0.0, "recording": 0.0}
         self._stack = contextlib.ExitStack()
         self.recorder = GroundRecorder(
-            settings.recording, self.say, camera=camera, force_idr=self._force_idrs
+            settings.recording, self.report, camera=camera, force_idr=self._force_idrs
         )
         self._stack.callback(self.recorder.close, _STOP_S)
         try:
@@ -163,7 +163,7 @@ class Intake:
             self._follow()
         if now_s >= self._due_s["recording"]:
             self._due_s["recording"] = now_s + _RECORDING_S
-            self._say(bus_messages.RECORDING, bus_messages.STATION, self.recorder.state())
+            self._publish(bus_messages.RECORDING, bus_messages.STATION, self.recorder.state())
 
     def ask(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Answers a question of the bus; raises a `BlimpError` for what cannot be done."""
@@ -188,7 +188,7 @@ class Intake:
         self._feed.send(payload_id, poses.pose_message(note, time.time_ns()))
         self.recorder.estimate(payload_id, note)
 
-    def say(self, name: str, level: Level, text: str) -> None:
+    def report(self, name: str, level: Level, text: str) -> None:
         """Says an event of the recorder's."""
         self._event("intake", level, name, text, bus_messages.STATION)
         self._due_s["recording"] = 0.0
@@ -203,7 +203,7 @@ class Intake:
             self.recorder.note(bus_messages.EVENT, payload_id, note)
 
     def _make(self, payload_id: str) -> Payload:
-        payload = Payload(payload_id, self._folder, self._say, self.recorder)
+        payload = Payload(payload_id, self._folder, self._publish, self.recorder)
         payload.clock = lambda: self._listener.clock(payload_id)
         return payload
 
@@ -293,26 +293,26 @@ class Intake:
                 self._event("intake", bus_messages.WARNING, "payload-gone", text, payload.id)
             payload.follow(self.video.stream_of(payload.id))
             stream = payload.stream
-            self._tell(payload.id, "stream-problem", stream.problem if stream else "")
+            self._report_once(payload.id, "stream-problem", stream.problem if stream else "")
             disputed = self._announced.disputed(payload.id)
             text = "two payloads call themselves so; the first one's video is kept"
-            self._tell(payload.id, "payload-twice", text if disputed else "")
+            self._report_once(payload.id, "payload-twice", text if disputed else "")
             note = payload.note(
                 self._listener.state(payload.id), self._listener, encrypted=self.video.encrypted
             )
-            self._say(bus_messages.PAYLOAD, payload.id, note)
+            self._publish(bus_messages.PAYLOAD, payload.id, note)
             self.recorder.note(bus_messages.PAYLOAD, payload.id, note)
             if payload.id.startswith(NAMELESS) and not payload.alive:
                 self._roster.forget(payload)
         refused = ", ".join(sorted(self._roster.refused))
         text = f"no place for {refused[:100]}: payloads.most" if refused else ""
-        self._tell(bus_messages.STATION, "payloads-too-many", text)
+        self._report_once(bus_messages.STATION, "payloads-too-many", text)
         unlisted = ", ".join(self._listener.unlisted())
         text = (
             f"{unlisted[:100]} reaches this station and is not on its list: revoked, or made since"
             " the station's keys were copied here; then copy their folder again"
         )
-        self._tell(bus_messages.STATION, UNLISTED, text if unlisted else "")
+        self._report_once(bus_messages.STATION, UNLISTED, text if unlisted else "")
 
     def _elsewhere(self, payload_id: str) -> str:
         """Another station that a payload says it sends its video to; "" for none."""
@@ -320,7 +320,7 @@ class Intake:
         health = state.health if state is not None else None
         return health.ground if health is not None and health.ground != self._listener.name else ""
 
-    def _tell(self, payload_id: str, name: str, problem: str) -> None:
+    def _report_once(self, payload_id: str, name: str, problem: str) -> None:
         """Says a problem once, and once that it is over."""
         key = f"{payload_id} {name}"
         before = self._told.get(key, "")
@@ -334,12 +334,12 @@ class Intake:
 
     def _event(self, source: str, level: Level, name: str, text: str, payload_id: str) -> None:
         note = EventMessage(time.time_ns(), source, level, name, text)
-        self._say(bus_messages.EVENT, payload_id, note)
+        self._publish(bus_messages.EVENT, payload_id, note)
         self.recorder.note(bus_messages.EVENT, payload_id, note)
 
-    def _say(self, kind: str, payload_id: str, note: Message) -> None:
+    def _publish(self, kind: str, payload_id: str, note: Message) -> None:
         with contextlib.suppress(Exception):  # a bus that is gone comes back, or all end
-            self._say_note(kind, payload_id, note)
+            self._publish_message(kind, payload_id, note)
 
     def _force_idrs(self) -> None:
         """Asks all that live for an IDR, without waiting for any of them."""

@@ -31,7 +31,7 @@ _RECORD = struct.Struct("<BQ")
 _TIMES = struct.Struct("<QQ")
 _MOST_RECORDS = 1_000_000
 
-Say = Callable[[str, Level, str], object]
+Report = Callable[[str, Level, str], object]
 """(name, level, text) of an event."""
 
 
@@ -58,7 +58,7 @@ def newest_cut(folder: Path) -> Cut | None:
     return Cut(newest.name, _until_ns(newest), written_ns, len(cut))
 
 
-def begin(recorder: GroundRecorder, settings: RecordingSettings, say: Say) -> None:
+def begin(recorder: GroundRecorder, settings: RecordingSettings, report: Report) -> None:
     """Goes on with a recording that was cut lately, and begins one where that is configured.
 
     Whatever hinders either is said, and stands as the recorder's problem. It may wait for the disk.
@@ -70,13 +70,15 @@ def begin(recorder: GroundRecorder, settings: RecordingSettings, say: Say) -> No
         cut = None  # the first recording makes the folder
     except OSError as error:
         cut = None
-        say(
+        report(
             CUT,
             bus_messages.WARNING,
             f"recording.folder '{settings.folder}': {error.strerror or error}",
         )
     if cut is not None and not _goes_on(cut, settings, now_ns):
-        say(CUT, bus_messages.INFO, f"{cut.file} was cut and does not go on (recording.resume_s)")
+        report(
+            CUT, bus_messages.INFO, f"{cut.file} was cut and does not go on (recording.resume_s)"
+        )
         cut = None
     try:
         if cut is None:
@@ -86,18 +88,18 @@ def begin(recorder: GroundRecorder, settings: RecordingSettings, say: Say) -> No
         if cut.in_a_row >= MOST_IN_A_ROW:
             recorder.refuse(f"the last {cut.in_a_row} recordings were cut; start one by hand")
             return
-        _resume(recorder, cut, say)
+        _resume(recorder, cut, report)
     except BlimpError as error:
         where = f"{cut.file} was cut and cannot go on: " if cut else ""
         recorder.refuse(f"{where}{error}")
 
 
-def _resume(recorder: GroundRecorder, cut: Cut, say: Say) -> None:
+def _resume(recorder: GroundRecorder, cut: Cut, report: Report) -> None:
     file = recorder.start()
     text = f"{cut.file} was cut and has no index; {file} goes on"
     if cut.until_ns is not None:
         text += f", {max(0.0, 1e-9 * (time.time_ns() - cut.until_ns)):.1f} s between them are lost"
-    say(bus_messages.RECORDING_RESUMED, bus_messages.WARNING, text)
+    report(bus_messages.RECORDING_RESUMED, bus_messages.WARNING, text)
     recorder.resumed = text
 
 

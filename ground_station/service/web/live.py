@@ -53,7 +53,7 @@ class Live:
         self._alarms: dict[str, alarms.Standing] = {}
         self._alive: frozenset[str] = frozenset()
         self._job_ran = False
-        self._say: Callable[[str, EventMessage], None] = lambda *_: None
+        self._publish_event: Callable[[str, EventMessage], None] = lambda *_: None
         self._fleet: Fleet | None = None
 
     # What the bus says
@@ -74,7 +74,9 @@ class Live:
         bus.subscribe(bus_messages.RECORDING, RecordingMessage, later(self.recording))
         if self.video is not None:
             bus.subscribe(bus_messages.FRAME, FrameMessage, self.video.frame)
-        self._say = lambda payload_id, note: bus.publish(bus_messages.EVENT, payload_id, note)
+        self._publish_event = lambda payload_id, note: bus.publish(
+            bus_messages.EVENT, payload_id, note
+        )
 
     def estimate(self, payload_id: str, note: EstimateMessage) -> None:
         """Each viewer gets its own payload's at once, those of others now and then."""
@@ -99,7 +101,7 @@ class Live:
         """Everybody is told."""
         document = bus_messages.as_document(note)
         document["text"] = document["text"][:TEXT]
-        self._tell(said("event", event={**document, "payload": payload_id}))
+        self._send_to_viewers(said("event", event={**document, "payload": payload_id}))
 
     def recording(self, _: str, note: RecordingMessage) -> None:
         """Everybody is told the newest."""
@@ -137,7 +139,7 @@ class Live:
         if self._fleet is not None:
             own = [standing.alarm for standing in self._alarms.values()]
             cpu = sum(process["cpu"] for process in state["processes"])
-            self._fleet.tell(own, self._looked_at(), cpu)
+            self._fleet.publish_state(own, self._looked_at(), cpu)
             state["alarms"] += self._fleet.where.alarms()
             self._want()
         self._snapshot.set_alarms(state["alarms"])
@@ -148,7 +150,7 @@ class Live:
         self._follow_job(state["job"])
         alive = frozenset(name for name, item in state["payloads"].items() if item["alive"])
         for payload_id in self._alive - alive:
-            self._tell(said("gone", payload=payload_id))
+            self._send_to_viewers(said("gone", payload=payload_id))
         self._alive = alive
         for viewer in self._viewers:
             if viewer.payload_id is None and alive:
@@ -159,12 +161,14 @@ class Live:
                 viewer.outbox.replace("state", text)
 
     def _alarm(self, alarm: alarms.Alarm, active: bool) -> None:
-        self._tell(said("alarm", active=active, alarm=vars(alarm)))
+        self._send_to_viewers(said("alarm", active=active, alarm=vars(alarm)))
         level, word = (alarm.level, "begins") if active else (bus_messages.INFO, "is over")
         text = f"alarm {word}: {alarm.text}"
         name = "alarm-begins" if active else "alarm-over"
         with contextlib.suppress(Exception):  # the bus may be what fails
-            self._say(alarm.payload, EventMessage(time.time_ns(), "web", level, name, text))
+            self._publish_event(
+                alarm.payload, EventMessage(time.time_ns(), "web", level, name, text)
+            )
 
     def _follow_job(self, job: dict[str, Any] | None) -> None:
         runs = bool(job and job["running"])
@@ -173,12 +177,12 @@ class Live:
             text = f"{job['command']}: {job['line'] or 'ended'}"
             with contextlib.suppress(Exception):  # the bus may be what fails
                 note = EventMessage(time.time_ns(), "web", level, "job-ended", text)
-                self._say(bus_messages.STATION, note)
+                self._publish_event(bus_messages.STATION, note)
         self._job_ran = runs
 
-    def _tell(self, text: str) -> None:
+    def _send_to_viewers(self, text: str) -> None:
         for viewer in self._viewers:
-            viewer.outbox.tell(text)
+            viewer.outbox.queue(text)
 
     # Viewers
 
@@ -199,7 +203,7 @@ class Live:
         if payload_id not in self._snapshot.payload_ids():
             payload_id = min(self._snapshot.living(), default=None)
         viewer = Viewer(payload_id, self._metrics.pictures_sent.inc)
-        viewer.outbox.tell(self._hello(viewer))
+        viewer.outbox.queue(self._hello(viewer))
         self._viewers.add(viewer)
         self._want()
         try:
@@ -246,13 +250,13 @@ class Live:
                 self._metrics.shown(viewer.payload_id, shown_ms / 1e3)
         elif kind == "ping":
             sent_ms = finite(message.get("sent_ms", 0), "ping: sent_ms")
-            viewer.outbox.tell(said("pong", sent_ms=sent_ms, now_ns=time.time_ns()))
+            viewer.outbox.queue(said("pong", sent_ms=sent_ms, now_ns=time.time_ns()))
 
     def _select(self, viewer: Viewer, payload_id: str) -> None:
         if payload_id in self._snapshot.payload_ids():
             viewer.payload_id = payload_id
         viewer.outbox.forget_picture()
-        viewer.outbox.tell(said("selected", payload=viewer.payload_id))
+        viewer.outbox.queue(said("selected", payload=viewer.payload_id))
         self._want()
 
     def _want(self) -> None:

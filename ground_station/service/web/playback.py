@@ -96,7 +96,7 @@ class Playback:
             if message.get("payload") not in self._tape.payloads:
                 raise Broken("select: payload is not of this recording")
             self._viewer.payload_id = message["payload"]
-            self._viewer.outbox.tell(said("selected", payload=self._viewer.payload_id))
+            self._viewer.outbox.queue(said("selected", payload=self._viewer.payload_id))
             self._seek(self._now_ns())
         elif kind == "video":
             if not isinstance(message.get("on"), bool):
@@ -195,7 +195,7 @@ class Playback:
             tape={"begin_ns": tape.begin_ns, "length_s": length_s, "marks": tape.marks},
             state=self._document(full=True),
         )
-        self._post(self._viewer.outbox.tell, text)
+        self._post(self._viewer.outbox.queue, text)
         if self._picture:
             self._post(self._viewer.outbox.show, self._picture)
 
@@ -247,7 +247,7 @@ class Playback:
             self._snapshot.event(payload_id, note)
             if shown:
                 document = {**bus_messages.as_document(note), "payload": payload_id}
-                self._post(outbox.tell, said("event", event=document))
+                self._post(outbox.queue, said("event", event=document))
 
     def _decode(self, heard: Heard, shown: bool) -> None:
         """Each unit is decoded; a picture is encoded as often as live ones are."""

@@ -29,7 +29,7 @@ from ground_station.service.web.models import (
     StationName,
 )
 from ground_station.service.web.problems import Busy, NotFound, problems
-from pi_firmware.wire.errors import BlimpError, told
+from pi_firmware.wire.errors import BlimpError, os_errors_as
 
 _FILES = 500
 _PIECE_BYTES = 256 * 1024
@@ -135,7 +135,7 @@ class Recordings:
         if not self._exporting.acquire(blocking=False):
             raise Busy("another trajectory is being read; try again then")
         try:
-            with told(name, NotFound):
+            with os_errors_as(name, NotFound):
                 return "".join(tum(read_poses(path)))
         finally:
             self._exporting.release()
@@ -145,7 +145,7 @@ class Recordings:
         self.size(name)
         if name == self._active():
             raise GroundStationError(f"{name} is being written; stop the recording first")
-        with told(name, NotFound):
+        with os_errors_as(name, NotFound):
             (self._folder / name).unlink()
 
     def _summary(self, name: str, status: os.stat_result) -> _Told:

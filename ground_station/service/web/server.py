@@ -63,8 +63,8 @@ class Server(uvicorn.Server):
         yield
 
 
-def complain(say: Callable[[str, str], object], listening: socket.socket) -> Callable[..., None]:
-    """A handler of a loop's exceptions: that no connection can be taken is one line to `say`.
+def complain(log: Callable[[str, str], object], listening: socket.socket) -> Callable[..., None]:
+    """A handler of a loop's exceptions: that no connection can be taken is one line to `log`.
 
     asyncio would tell it with a traceback for each place in the queue, again each second; and when
     the server ends within that second, each of these places is tried once more on a socket that is
@@ -74,7 +74,7 @@ def complain(say: Callable[[str, str], object], listening: socket.socket) -> Cal
     def handle(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
         error = context.get("exception")
         if isinstance(error, OSError) and error.errno in _EXHAUSTED:
-            say("connections", f"no connection is taken: {error.strerror}")
+            log("connections", f"no connection is taken: {error.strerror}")
         elif not (isinstance(error, ValueError) and listening.fileno() < 0):
             loop.default_exception_handler(context)
 

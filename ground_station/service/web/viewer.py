@@ -31,7 +31,7 @@ class Outbox:
         self._picture: bytes | None = None
         self._there = asyncio.Event()
 
-    def tell(self, text: str) -> None:
+    def queue(self, text: str) -> None:
         """Queues a message; the oldest goes when there are too many."""
         self._texts.append(text)
         self._there.set()

@@ -115,7 +115,7 @@ class LibcameraSource(LiveSource):
         self._pad = self._element.get_static_pad("src")
         self._probe = self._pad.add_probe(kind, self._on_event)
 
-    def told(self) -> tuple[float | None, float | None]:
+    def exposure_and_gain(self) -> tuple[float | None, float | None]:
         """What the camera's metadata says; None for both where it says nothing.
 
         After a while a fixed exposure or gain that the camera does not keep ends the source.

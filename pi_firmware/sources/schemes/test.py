@@ -120,7 +120,7 @@ class PatternSource(LiveSource):
         super().attach(pipeline)
         self._faults.attach(pipeline)
 
-    def told(self) -> tuple[float | None, float | None]:
+    def exposure_and_gain(self) -> tuple[float | None, float | None]:
         return self._camera.exposure_s or None, self._camera.gain or None
 
 

@@ -175,7 +175,7 @@ class V4l2Source(LiveSource):
         super().attach(pipeline)
         self._pipeline.get_by_name("source").set_property("device", self._uri.path)
 
-    def told(self) -> tuple[float | None, float | None]:
+    def exposure_and_gain(self) -> tuple[float | None, float | None]:
         """The fixed exposure and gain, which were read back when they were set."""
         return self._camera.exposure_s or None, self._camera.gain or None
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, cast
 
 from pi_firmware.wire import sei
-from pi_firmware.wire.errors import BlimpError, RecordingError, told
+from pi_firmware.wire.errors import BlimpError, RecordingError, os_errors_as
 
 if TYPE_CHECKING:
     from pi_firmware.wire.recording import RecordingWriter
@@ -124,7 +124,7 @@ class RecordingFile:
         self._gop_bytes = self._longest_gop_bytes = 0
         self._unsynced = True
         self._ended = False
-        with told(path, RecordingError):
+        with os_errors_as(path, RecordingError):
             self._file = open_file(path)
         try:
             self.writer = self._opened(head)
@@ -143,7 +143,7 @@ class RecordingFile:
         )
         for name, values in head.items():
             writer.write_metadata(name, values)
-        with told(self.path, RecordingError):
+        with os_errors_as(self.path, RecordingError):
             self._file.sync()
         return writer
 
@@ -214,7 +214,7 @@ class RecordingFile:
         """Flushes, and waits until the card has it; does nothing when it has all."""
         if self._unsynced:
             self.flush()
-            with told(self.path, RecordingError):
+            with os_errors_as(self.path, RecordingError):
                 self._file.sync()
             self._unsynced = False
 

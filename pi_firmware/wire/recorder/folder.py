@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from pi_firmware.wire import files
-from pi_firmware.wire.errors import RecordingError, told
+from pi_firmware.wire.errors import RecordingError, os_errors_as
 
 MB = 1_000_000
 _NAME = re.compile(r"flight-([0-9]{6,9})(?:-[0-9TZ]{16})?\.mcap")
@@ -66,7 +66,7 @@ class Folder:
 
     def next_path(self, stamp: str = "") -> Path:
         """Looks through the folder, made if missing; the path of the file to write next."""
-        with self._told():
+        with self._disk_errors():
             self.path.mkdir(exist_ok=True)
             highest = self._scan()
         if highest >= _HIGHEST:
@@ -81,13 +81,13 @@ class Folder:
         """
         while self._earlier and self._earlier_bytes + file_bytes > self._total_bytes:
             _, path, size = self._earlier[0]
-            with told(f"{path}: the oldest recording cannot be deleted", RecordingError):
+            with os_errors_as(f"{path}: the oldest recording cannot be deleted", RecordingError):
                 path.unlink(missing_ok=True)
             del self._earlier[0]
             self._earlier_bytes -= size
         if not self._min_free_bytes:
             return  # until the disk itself is full
-        with self._told():
+        with self._disk_errors():
             disk = os.statvfs(self.path)
         free_bytes = disk.f_bavail * disk.f_frsize
         if free_bytes - more_bytes < self._min_free_bytes:
@@ -98,7 +98,7 @@ class Folder:
 
     def sync(self) -> None:
         """Makes names durable: of files that were begun, ended or deleted."""
-        with self._told():
+        with self._disk_errors():
             files.sync(self.path)
 
     def _scan(self) -> int:
@@ -121,5 +121,5 @@ class Folder:
         self._earlier_bytes = sum(size for _, _, size in self._earlier)
         return highest
 
-    def _told(self) -> AbstractContextManager[None]:
-        return told(f"recording.folder '{self.path}'", RecordingError)
+    def _disk_errors(self) -> AbstractContextManager[None]:
+        return os_errors_as(f"recording.folder '{self.path}'", RecordingError)

@@ -100,7 +100,7 @@ class Recorder:
                 )
             run = self._begun()
             name = run.name
-        self._tell(messages.EVENT_RECORDING_STARTED, name)
+        self._try_announce(messages.EVENT_RECORDING_STARTED, name)
         with contextlib.suppress(Exception):
             self._force_idr()
         return name
@@ -118,7 +118,7 @@ class Recorder:
                 run.give_up()
                 self._hung = run
                 run.reason = f"the disk did not take its end within {limit_s:g} s"
-                self._tell(messages.EVENT_RECORDING_ENDED, f"{run.name}: {run.reason}")
+                self._try_announce(messages.EVENT_RECORDING_ENDED, f"{run.name}: {run.reason}")
             return self._latest.name if self._latest else ""
 
     def close(self, limit_s: float | None = None) -> None:
@@ -126,17 +126,17 @@ class Recorder:
         self.stop(limit_s)
 
     def _begun(self) -> Run:
-        def told(goes_on: bool, text: str) -> None:
+        def report(goes_on: bool, text: str) -> None:
             if goes_on:
-                self._tell(messages.EVENT_RECORDING_STARTED, text)
+                self._try_announce(messages.EVENT_RECORDING_STARTED, text)
                 return
             if self._run is run:
                 self._run = None
-            self._tell(messages.EVENT_RECORDING_ENDED, text)
+            self._try_announce(messages.EVENT_RECORDING_ENDED, text)
 
         run = self.run_type(
             self._settings,
-            told=told,
+            report=report,
             force_idr=self._force_idr,
             head=self._head,
             open_file=self._open_file,
@@ -152,7 +152,7 @@ class Recorder:
         run.go()
         return run
 
-    def _tell(self, name: str, text: str) -> None:
+    def _try_announce(self, name: str, text: str) -> None:
         """A link that fails to take an event ends no recording."""
         with contextlib.suppress(Exception):
             self._announce(name, text)

@@ -141,7 +141,7 @@ TIMES_NS = range(1 << 63)
 class Run(ABC):
     """Writes what `queue` is given until `end`, or until the disk takes no more.
 
-    `told` is called on the thread with True and a text for a file that goes on from another, and
+    `report` is called on the thread with True and a text for a file that goes on from another, and
     once with False and how much there is when all has ended, and why unless `end` was called.
     What an item is, where it goes and when the next file begins is a subclass's: `_put`.
     """
@@ -150,7 +150,7 @@ class Run(ABC):
         self,
         limits: Limits,
         *,
-        told: Callable[[bool, str], None],
+        report: Callable[[bool, str], None],
         force_idr: Callable[[], object],
         head: Mapping[str, Mapping[str, str]],
         open_file: OpenFile,
@@ -163,7 +163,7 @@ class Run(ABC):
         self.reason = ""
         """Why it ended, in words, when nobody asked for it."""
         self._limits = limits
-        self._told, self._force_idr = told, force_idr
+        self._report, self._force_idr = report, force_idr
         self._head = dict(head)
         self._open_file = open_file
         self._folder = Folder(limits)
@@ -205,7 +205,7 @@ class Run(ABC):
     def end(self, limit_s: float) -> bool:
         """Ends the file; whether that was done within the limit.
 
-        What `told` does of it may take as long again, at most.
+        What `report` does of it may take as long again, at most.
         """
         self.queue.close()
         done = self._closed.wait(limit_s)
@@ -263,9 +263,9 @@ class Run(ABC):
         self.reason = reason or ""
         self._closed.set()
         if not self._given_up:
-            self._told(False, self._told_at_end(reason))
+            self._report(False, self._summary(reason))
 
-    def _told_at_end(self, reason: str | None) -> str:
+    def _summary(self, reason: str | None) -> str:
         names = self.name if self.name == self._first else f"{self._first} to {self.name}"
         text = f"{names}: {self._frames} frames"
         return f"{text}; {reason}" if reason else text
@@ -310,7 +310,7 @@ class Run(ABC):
         """Begins the next file beside the one of now, which is to be ended by `_end_earlier`."""
         before = self.name
         self._open_next()
-        self._told(True, f"{self.name}, after {before}")
+        self._report(True, f"{self.name}, after {before}")
 
     def _end_earlier(self, file: RecordingFile) -> None:
         """Ends a file that has all that belongs to it, while the newest goes on."""

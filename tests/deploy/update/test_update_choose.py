@@ -187,9 +187,9 @@ print(json.dumps([pi_firmware.__version__, library.NAME, os.getpid(), sys.argv[1
 
 
 def test_start_tells_the_version_of_the_images_release(card: Card) -> None:
-    assert start.told(card.at, card.choice())["version"] == NOW
+    assert start.release_of(card.at, card.choice())["version"] == NOW
     (card.at.factory / "release.json").unlink()
-    told = start.told(card.at, card.choice())
+    told = start.release_of(card.at, card.choice())
     assert told == {"version": "", "how": "factory", "reason": ""}
 
 
