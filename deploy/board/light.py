@@ -205,14 +205,14 @@ class Judge:
         return None, view.firmware.active
 
 
-class Teller:
+class StatusWriter:
     """Writes STATUS.txt when a state has settled that is another than the one written last."""
 
     def __init__(self, card: Card, disk: Disk, now_s: float) -> None:
         self._card, self._disk = card, disk
         self._state: tuple[Fault | None, bool] | None = None
         self._since_s = now_s
-        self.told = False  # what there is to tell of this state has been told
+        self.written = False  # what there is to tell of this state has been told
         self._failed = False
         self._writes = 0
 
@@ -221,12 +221,12 @@ class Teller:
     ) -> None:
         """`text` makes the file; it is called when there is something to tell and no sooner."""
         if (fault, streams) != self._state:
-            self._state, self._since_s, self.told = (fault, streams), now_s, False
-        if self.told or now_s - self._since_s < SETTLED_S or self._writes >= MOST_WRITES:
+            self._state, self._since_s, self.written = (fault, streams), now_s, False
+        if self.written or now_s - self._since_s < SETTLED_S or self._writes >= MOST_WRITES:
             return
         if fault is None and not streams:
             return  # it is starting
-        self.told = True
+        self.written = True
         try:
             self._writes += status.write(self._card, self._disk, text())
         except (DeployError, OSError) as error:
@@ -314,16 +314,20 @@ def main() -> int:
     """Runs until it is ended."""
     card, service = Card(), Service()
     now_s = time.monotonic()
-    led, judge, teller = StatusLed(card.root), Judge(now_s), Teller(card, Disk(), now_s)
+    led, judge, status_writer = (
+        StatusLed(card.root),
+        Judge(now_s),
+        StatusWriter(card, Disk(), now_s),
+    )
     while True:
         begun_s = time.monotonic()
         view = look(card, service)
         resolve(card)
         fault, streams = judge.fault(view, begun_s)
-        teller.report(fault, streams, partial(text_of, card, fault, view), begun_s)
+        status_writer.report(fault, streams, partial(text_of, card, fault, view), begun_s)
         if fault is None:
             (led.heartbeat if streams else led.steady)()
-        until_s = begun_s + (CALM_S if teller.told else LOOK_S)
+        until_s = begun_s + (CALM_S if status_writer.written else LOOK_S)
         while fault is not None and time.monotonic() < until_s:
             led.blink(fault.blinks)
         time.sleep(max(0.0, until_s - time.monotonic()))

@@ -179,11 +179,11 @@ def build(
         ext4.make(place, size, tree, ROOT_LABEL, new.uuid("root"), epoch)
         log("boot and data partition, image, block map and checksums")
         packages = packages_of(tree)
-        told = Told(board.name, checkout, epoch, packages, site, units)
+        told = BuildRecord(board.name, checkout, epoch, packages, site, units)
         finish(work / image.name, front, place, new, told)
 
 
-def finish(image: Path, front: Tree, root_place: Path, new: Identifiers, told: Told) -> None:
+def finish(image: Path, front: Tree, root_place: Path, new: Identifiers, told: BuildRecord) -> None:
     """Puts an image together from a boot partition's files and a root partition's file system.
 
     Adds the data partition, empty: the card makes its folders and grows it. Writes block map,
@@ -277,7 +277,7 @@ _TOOLS = {
 
 
 @dataclass(frozen=True)
-class Told:
+class BuildRecord:
     """What an image does not tell by itself.
 
     Attributes:
@@ -297,7 +297,7 @@ class Told:
     base: Path | None = None
 
 
-def write(image: Path, to: Path, digest: str, told: Told) -> None:
+def write(image: Path, to: Path, digest: str, told: BuildRecord) -> None:
     """Writes the manifest of a finished image, whose SHA-256 in hex is `digest`."""
     partitions = []
     for name, part in zip(_PARTITIONS, table(image), strict=True):

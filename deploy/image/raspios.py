@@ -89,7 +89,7 @@ def build(
         files = _boot_files(base, boot_place, work / "base-files")
         front = card.boot_contents(board.name, _KERNEL, board.machine, files, first, where)
         log("boot and data partition, image, block map and checksums")
-        told = card.Told(board.name, checkout, epoch, packages, site, units, base)
+        told = card.BuildRecord(board.name, checkout, epoch, packages, site, units, base)
         card.finish(work / image.name, front, root_place, new, told)
 
 

@@ -16,7 +16,7 @@ from ground_station.calibration.board import Board
 from ground_station.calibration.calibrate import Result
 from ground_station.calibration.selection import CORNER_SHARE
 from ground_station.calibration.views import View
-from ground_station.presentation.pages import shown, write_page
+from ground_station.presentation.pages import themed_figure, write_page
 from ground_station.presentation.theme import Theme, sheet, themed
 
 WIDTH_IN = 6.6
@@ -145,17 +145,17 @@ def write_report(
         regions=results.region_rows(result),
         notes=result.notes,
         figures=[
-            shown(
+            themed_figure(
                 "Where corners were seen",
                 "The corners of the board in the picture; the four corners of the picture framed",
                 lambda theme: coverage(result, theme),
             ),
-            shown(
+            themed_figure(
                 f"Residuals, {times:g} times as long",
                 "Arrows from where the lens puts each corner to where it was seen",
                 lambda theme: residuals(result, theme),
             ),
-            shown(
+            themed_figure(
                 "Each view",
                 "The RMS of each view's residuals, and the median",
                 lambda theme: per_view(result, theme),

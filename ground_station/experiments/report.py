@@ -16,7 +16,7 @@ from ground_station.experiments.declaration import FLIGHT_S, IMAGES
 from ground_station.experiments.summary import claim_line, reasons
 from ground_station.files import finite, write_json, write_text
 from ground_station.map.floorplan import FloorPlan, load_floorplan
-from ground_station.presentation.pages import Shown, shown, write_page
+from ground_station.presentation.pages import ThemedFigure, themed_figure, write_page
 from ground_station.presentation.readme import Block
 from ground_station.presentation.text import flat
 from ground_station.presentation.text import markdown as markdown_table
@@ -89,7 +89,7 @@ def good(document: dict[str, Any]) -> bool:
     return not document["worse"] and all(c["kept"] is not False for c in document["claims"])
 
 
-def _pictures(experiment: dict[str, Any], atrium: FloorPlan | None) -> list[Shown]:
+def _pictures(experiment: dict[str, Any], atrium: FloorPlan | None) -> list[ThemedFigure]:
     cases = [
         c for c in experiment["cases"] if any(pictures.first_series(c, p) for p in c["presets"])
     ]
@@ -100,26 +100,36 @@ def _pictures(experiment: dict[str, Any], atrium: FloorPlan | None) -> list[Show
     if experiment["level"]:
         level = experiment["level"]
         found.append(
-            shown(f"Error over {level}", f"{name}: position error and share localized over {level}",
-                  lambda theme: pictures.sweep(experiment["cases"], level, theme))
-        )  # fmt: skip
+            themed_figure(
+                f"Error over {level}",
+                f"{name}: position error and share localized over {level}",
+                lambda theme: pictures.sweep(experiment["cases"], level, theme),
+            )
+        )
     indoors = {case["flight"]["scene"] for case in cases if not case["flight"]["folder"]}
     plan = atrium if indoors == {"atrium"} else None
     if any(pictures.first_series(case, "default") for case in cases):
         found.append(
-            shown("Paths, coloured by their error", f"{name}: paths from above, by error",
-                  lambda theme: pictures.paths(cases, plan, theme))
-        )  # fmt: skip
+            themed_figure(
+                "Paths, coloured by their error",
+                f"{name}: paths from above, by error",
+                lambda theme: pictures.paths(cases, plan, theme),
+            )
+        )
     found.append(
-        shown("Error over time: preset thesis dashed, each frame alone dotted",
-              f"{name}: position error over time",
-              lambda theme: pictures.over_time(cases, theme))
-    )  # fmt: skip
+        themed_figure(
+            "Error over time: preset thesis dashed, each frame alone dotted",
+            f"{name}: position error over time",
+            lambda theme: pictures.over_time(cases, theme),
+        )
+    )
     found.append(
-        shown("Share of frames within an error: preset thesis dashed, each frame alone dotted",
-              f"{name}: distribution of the position error",
-              lambda theme: pictures.distribution(cases, theme))
-    )  # fmt: skip
+        themed_figure(
+            "Share of frames within an error: preset thesis dashed, each frame alone dotted",
+            f"{name}: distribution of the position error",
+            lambda theme: pictures.distribution(cases, theme),
+        )
+    )
     return found
 
 

@@ -22,7 +22,7 @@ TEMPLATES = Path(__file__).parent / "templates"
 
 
 @dataclass(frozen=True)
-class Shown:
+class ThemedFigure:
     """A picture in two dresses as data URIs, and words for those who do not see it."""
 
     heading: str
@@ -31,10 +31,10 @@ class Shown:
     words: str
 
 
-def shown(heading: str, words: str, draw: Callable[[Theme], Figure]) -> Shown:
+def themed_figure(heading: str, words: str, draw: Callable[[Theme], Figure]) -> ThemedFigure:
     """The picture that `draw` makes in each theme."""
     light, dark = (data_uri("png", png(draw(theme))) for theme in (LIGHT, DARK))
-    return Shown(heading, light, dark, words)
+    return ThemedFigure(heading, light, dark, words)
 
 
 def data_uri(kind: str, encoded: bytes) -> str:

@@ -51,7 +51,7 @@ def set_on_v4l2(settings: Settings) -> dict[int, int]:
         else:
             data[:] = v4l2._CONTROL.pack(control, held[control])
 
-    assert [v4l2.apply(wish, 0, ioctl) for wish in v4l2.wishes(settings.camera, None)]
+    assert [v4l2.apply(wish, 0, ioctl) for wish in v4l2.control_requests(settings.camera, None)]
     return {control: value for control, value in held.items() if control != 0x009A0903}
 
 

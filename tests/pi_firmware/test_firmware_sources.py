@@ -91,8 +91,8 @@ def uvc() -> dict[int, list[int]]:
 
 
 def refusals(device: Device, camera: CameraSettings, focus: int | None = None) -> list[str]:
-    wishes = v4l2.wishes(camera, focus)
-    return [said for wish in wishes if (said := v4l2.apply(wish, 0, device.ioctl))]
+    control_requests = v4l2.control_requests(camera, focus)
+    return [said for wish in control_requests if (said := v4l2.apply(wish, 0, device.ioctl))]
 
 
 def test_what_the_configuration_fixes_is_set_in_the_device_and_confirmed() -> None:

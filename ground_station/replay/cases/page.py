@@ -10,7 +10,7 @@ import numpy as np
 
 from ground_station.evaluation.figures import digits
 from ground_station.geometry.trajectory import Trajectory
-from ground_station.presentation.pages import Shown, shown, write_page
+from ground_station.presentation.pages import ThemedFigure, themed_figure, write_page
 from ground_station.replay.cases import measure, pictures
 from ground_station.replay.cases.compare import Comparison, Line
 from ground_station.replay.cases.frames import UNKNOWN
@@ -80,9 +80,9 @@ def cells(line: Line) -> tuple[str, str, str, str]:
     return a, b, worse, allowed
 
 
-def _of_comparison(c: Comparison) -> list[Shown]:
+def _of_comparison(c: Comparison) -> list[ThemedFigure]:
     a, b = c.a.frames, c.b.frames
-    found: list[Shown] = []
+    found: list[ThemedFigure] = []
     if len(c.time_ns):
         start_ns = int(min(a.time_ns.min(), b.time_ns.min()))
         gone = a.finite[c.pairs.a] & ~b.finite[c.pairs.b]
@@ -92,7 +92,7 @@ def _of_comparison(c: Comparison) -> list[Shown]:
         first = _place(c)
         plan = c.b.floorplan or c.a.floorplan
         found.append(
-            shown(
+            themed_figure(
                 "Where the poses of B are off those of A",
                 "B's path from above, coloured by its distance from A's pose of the same frame",
                 lambda theme: pictures.path(
@@ -121,7 +121,7 @@ def _of_comparison(c: Comparison) -> list[Shown]:
             Strip(name, (f.time_ns - start_ns) / 1e9, f.state) for name, f in (("A", a), ("B", b))
         ]
         found.append(
-            shown(
+            themed_figure(
                 "Over time",
                 "Errors of both runs, their difference and their states over time",
                 lambda theme: pictures.over_time(panels, strips, theme=theme),
@@ -134,7 +134,7 @@ def _of_comparison(c: Comparison) -> list[Shown]:
         )
     sets.append(("capture to pose, ms", [("A", a.latency_ms), ("B", b.latency_ms)]))
     found.append(
-        shown(
+        themed_figure(
             "How often",
             "The share of frames up to an error, and up to a latency, of both runs",
             lambda theme: pictures.distributions(sets, theme),
@@ -154,7 +154,7 @@ def _place(c: Comparison) -> np.ndarray | None:
     return None
 
 
-def _of_case(case: Judged) -> list[Shown]:
+def _of_case(case: Judged) -> list[ThemedFigure]:
     if case.outcome is None:
         return []
     bounds = {row.name: row.bound for row in case.rows}
@@ -173,7 +173,7 @@ def of_run(
     position_m: float | None = None,
     rotation_deg: float | None = None,
     latency_ms: float | None = None,
-) -> list[Shown]:
+) -> list[ThemedFigure]:
     """Path, errors against the truth, latency and states of a run; bounds are drawn as lines."""
     frames = outcome.frames
     if not len(frames):
@@ -197,7 +197,7 @@ def of_run(
         panels.append(("latency, ms", [series], latency_ms))
     under = [] if outcome.truth is None else [("truth", outcome.truth)]
     return [
-        shown(
+        themed_figure(
             "Path",
             "The path from above, coloured by its error",
             lambda theme: pictures.path(
@@ -209,7 +209,7 @@ def of_run(
                 theme=theme,
             ),
         ),
-        shown(
+        themed_figure(
             "Over time",
             "Error, latency and state over time; what was out is shaded",
             lambda theme: pictures.over_time(

@@ -44,7 +44,7 @@ _LATE_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class JsonMessage:
     """JSON text for a topic."""
 
     topic: str
@@ -74,7 +74,7 @@ class _Stream:
 
 
 class GroundRun(run.Run):
-    """Takes `Unit`, `Said` and `Estimated`.
+    """Takes `Unit`, `JsonMessage` and `Estimated`.
 
     A stream moves to the next file at its own IDR: nothing is lost between the two, and each file
     decodes by itself. The earlier one ends when all streams have moved.
@@ -119,7 +119,7 @@ class GroundRun(run.Run):
                 self._turn()
             elif self._current.size_bytes > self._folder.file_limit_bytes + run.OVERRUN_BYTES:
                 return
-        if isinstance(item, Said):
+        if isinstance(item, JsonMessage):
             if item.account is not None:
                 self._count(*item.account)
             self._write_message(item.topic, item.schema, item.log_ns, item.text)

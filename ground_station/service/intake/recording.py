@@ -19,7 +19,7 @@ from ground_station.service.bus_messages import (
     PayloadMessage,
     RecordingMessage,
 )
-from ground_station.service.intake.files import STATION_TOPIC, Estimated, GroundRun, Said
+from ground_station.service.intake.files import STATION_TOPIC, Estimated, GroundRun, JsonMessage
 from ground_station.service.settings import RecordingSettings
 from ground_station.stream.assembly import ReceivedFrame
 from pi_firmware.wire import keys, messages
@@ -100,7 +100,7 @@ class GroundRecorder(Recorder):
         with contextlib.suppress(Exception):
             text = messages.encode(message)
             topic = "/" + keys.key(payload_id, kind)
-            active.queue.put(Said(topic, message.SCHEMA, time.time_ns(), text), len(text))
+            active.queue.put(JsonMessage(topic, message.SCHEMA, time.time_ns(), text), len(text))
 
     def estimate(self, payload_id: str, note: EstimateMessage) -> None:
         """Records a pose, or that there is none."""
@@ -117,7 +117,7 @@ class GroundRecorder(Recorder):
             topic = f"{STATION_TOPIC}{place}/{kind}"
             text = bus_messages.encode(note)
             account = (payload_id, note.frames) if isinstance(note, PayloadMessage) else None
-            said = Said(topic, f"blimp.station.{kind}", time.time_ns(), text, account)
+            said = JsonMessage(topic, f"blimp.station.{kind}", time.time_ns(), text, account)
             active.queue.put(said, len(text))
 
     def state(self) -> RecordingMessage:

@@ -33,7 +33,7 @@ from ground_station.service.web import video
 from ground_station.service.web.live import STATE_S
 from ground_station.service.web.recordings import Recordings
 from ground_station.service.web.snapshot import Snapshot
-from ground_station.service.web.tape import Heard, Tape
+from ground_station.service.web.tape import Tape, TimedMessage
 from ground_station.service.web.viewer import (
     FAILED,
     TRY_LATER,
@@ -228,7 +228,7 @@ class Playback:
         document["playback"] = {"at_s": at_s, "playing": self._playing, "rate": self._rate}
         return document
 
-    def _take(self, heard: Heard, *, shown: bool, decoded: bool) -> None:
+    def _take(self, heard: TimedMessage, *, shown: bool, decoded: bool) -> None:
         note, payload_id, outbox = heard.note, heard.payload_id, self._viewer.outbox
         if heard.kind == VIDEO_TOPIC:
             if not self._tape.told:
@@ -249,7 +249,7 @@ class Playback:
                 document = {**bus_messages.as_document(note), "payload": payload_id}
                 self._post(outbox.queue, said("event", event=document))
 
-    def _decode(self, heard: Heard, shown: bool) -> None:
+    def _decode(self, heard: TimedMessage, shown: bool) -> None:
         """Each unit is decoded; a picture is encoded as often as live ones are."""
         import cv2
 

@@ -27,7 +27,7 @@ _NOTES: dict[str, type[Message]] = {
 
 
 @dataclass(frozen=True)
-class Heard:
+class TimedMessage:
     """A message of the bus, or an access unit of video (Annex B), at a log time."""
 
     log_ns: int
@@ -80,21 +80,23 @@ class Tape:
         )
         self.marks = list(self._marks())
 
-    def since(self, from_ns: int) -> Iterator[Heard]:
+    def since(self, from_ns: int) -> Iterator[TimedMessage]:
         """What was heard from a time on, in order."""
         return self._heard(from_ns, set(self._sources))
 
-    def _heard(self, from_ns: int, topics: set[str]) -> Iterator[Heard]:
+    def _heard(self, from_ns: int, topics: set[str]) -> Iterator[TimedMessage]:
         for channel, message in self._reader.since(from_ns, topics):
             payload_id, kind = self._sources[channel.topic]
             if kind == VIDEO_TOPIC:
                 with contextlib.suppress(ValueError):  # what is no video is left out
-                    yield Heard(message.log_time, payload_id, kind, video=_unit(message.data))
+                    yield TimedMessage(
+                        message.log_time, payload_id, kind, video=_unit(message.data)
+                    )
                 continue
             with contextlib.suppress(BlimpError):  # as is what an older station said otherwise
                 note = bus_messages.decode(_NOTES.get(kind, EstimateMessage), message.data)
                 note = self._named(note) if isinstance(note, EstimateMessage) else note
-                yield Heard(message.log_time, payload_id, kind, note)
+                yield TimedMessage(message.log_time, payload_id, kind, note)
 
     def _marks(self) -> Iterator[dict[str, Any]]:
         events = {topic for topic, (_, kind) in self._sources.items() if kind == bus_messages.EVENT}

@@ -53,7 +53,7 @@ Ioctl = Callable[[int, int, bytearray], object]
 
 
 @dataclass(frozen=True)
-class Wish:
+class ControlRequest:
     """One control that the configuration asks for; an optional one may be missing."""
 
     config_key: str
@@ -62,27 +62,27 @@ class Wish:
     optional: bool = False
 
 
-def wishes(camera: CameraSettings, focus: int | None) -> list[Wish]:
+def control_requests(camera: CameraSettings, focus: int | None) -> list[ControlRequest]:
     """The controls in the order in which a device takes them: an automatic goes off first."""
-    result = [Wish("camera.rate_hz", _EXPOSURE_MAY_SLOW, 0, optional=True)]
+    result = [ControlRequest("camera.rate_hz", _EXPOSURE_MAY_SLOW, 0, optional=True)]
     if camera.exposure_s > 0:
         ticks = max(1, round(camera.exposure_s * 1e4))
-        result.append(Wish("camera.exposure_s", _EXPOSURE_AUTO, _MANUAL_EXPOSURE))
-        result.append(Wish("camera.exposure_s", _EXPOSURE_100US, ticks))
+        result.append(ControlRequest("camera.exposure_s", _EXPOSURE_AUTO, _MANUAL_EXPOSURE))
+        result.append(ControlRequest("camera.exposure_s", _EXPOSURE_100US, ticks))
     if camera.gain > 0:
-        result.append(Wish("camera.gain", _GAIN_AUTO, 0, optional=True))
-        result.append(Wish("camera.gain", _GAIN, round(camera.gain)))
+        result.append(ControlRequest("camera.gain", _GAIN_AUTO, 0, optional=True))
+        result.append(ControlRequest("camera.gain", _GAIN, round(camera.gain)))
     if camera.white_balance != "auto":
-        result.append(Wish("camera.white_balance", _AUTO_WHITE_BALANCE, 0))
+        result.append(ControlRequest("camera.white_balance", _AUTO_WHITE_BALANCE, 0))
         kelvin = _LIGHT_K[camera.white_balance]
-        result.append(Wish("camera.white_balance", _WHITE_BALANCE_K, kelvin))
+        result.append(ControlRequest("camera.white_balance", _WHITE_BALANCE_K, kelvin))
     if focus is not None:
-        result.append(Wish("focus", _FOCUS_AUTO, 0, optional=True))
-        result.append(Wish("focus", _FOCUS, focus))
+        result.append(ControlRequest("focus", _FOCUS_AUTO, 0, optional=True))
+        result.append(ControlRequest("focus", _FOCUS, focus))
     return result
 
 
-def apply(wish: Wish, file: int, ioctl: Ioctl = fcntl.ioctl) -> str:
+def apply(wish: ControlRequest, file: int, ioctl: Ioctl = fcntl.ioctl) -> str:
     """Sets one control and reads it back; why the device refuses, or nothing."""
     query = bytearray(_QUERYCTRL.pack(wish.control, 0, b"", 0, 0, 0, 0, 0))
     try:
@@ -191,7 +191,7 @@ class V4l2Source(LiveSource):
         except OSError as error:
             raise self._uri.fail(error.strerror or str(error)) from None
         try:
-            for wish in wishes(camera, focus):
+            for wish in control_requests(camera, focus):
                 refusal = apply(wish, file)
                 if refusal:
                     raise self._uri.fail(refusal)

@@ -10,7 +10,7 @@ import pytest
 from board_cards import FastDisk, Person
 
 from deploy.board import light, provision, status
-from deploy.board.light import PATIENCE_S, SETTLED_S, Judge, Link, StatusLed, Teller, View
+from deploy.board.light import PATIENCE_S, SETTLED_S, Judge, Link, StatusLed, StatusWriter, View
 from deploy.board.releases.places import Places
 from deploy.board.releases.service import Seen
 from deploy.board.status import Fault
@@ -129,43 +129,43 @@ class Written(FastDisk):
 
 def test_the_card_is_written_to_when_a_state_has_settled_and_seldom(person: Person) -> None:
     disk = Written()
-    teller = Teller(person.card, disk, 0.0)
-    teller.report(status.NO_NETWORK, True, lambda: b"no network", 10.0)
-    teller.report(status.NO_NETWORK, True, lambda: b"no network", 10.0 + SETTLED_S - 1)
+    status_writer = StatusWriter(person.card, disk, 0.0)
+    status_writer.report(status.NO_NETWORK, True, lambda: b"no network", 10.0)
+    status_writer.report(status.NO_NETWORK, True, lambda: b"no network", 10.0 + SETTLED_S - 1)
     assert disk.count == 0
-    teller.report(status.NO_NETWORK, True, lambda: b"no network", 10.0 + SETTLED_S)
+    status_writer.report(status.NO_NETWORK, True, lambda: b"no network", 10.0 + SETTLED_S)
     assert (person.card.boot / "STATUS.txt").read_bytes() == b"no network"
     for second in range(100):
-        teller.report(status.NO_NETWORK, True, lambda: b"other words", 50.0 + second)
+        status_writer.report(status.NO_NETWORK, True, lambda: b"other words", 50.0 + second)
     assert disk.count == 1
-    teller.report(None, False, lambda: b"starting", 200.0)
-    teller.report(None, False, lambda: b"starting", 400.0)
+    status_writer.report(None, False, lambda: b"starting", 200.0)
+    status_writer.report(None, False, lambda: b"starting", 400.0)
     assert disk.count == 1
     for turn in range(50):  # it comes and goes all flight long
         now_s = 1000.0 + 100 * turn
         text = f"turn {turn}".encode()
         fault = status.NO_NETWORK if turn % 2 else None
-        teller.report(fault, True, lambda: b"never", now_s)
-        teller.report(fault, True, lambda text=text: text, now_s + SETTLED_S)
+        status_writer.report(fault, True, lambda: b"never", now_s)
+        status_writer.report(fault, True, lambda text=text: text, now_s + SETTLED_S)
     assert disk.count == light.MOST_WRITES
 
 
 def test_the_same_text_is_not_written_again(person: Person) -> None:
     disk = Written()
     for _ in range(3):  # three boots
-        teller = Teller(person.card, disk, 0.0)
-        teller.report(None, True, lambda: b"streaming", 0.0)
-        teller.report(None, True, lambda: b"streaming", SETTLED_S)
+        status_writer = StatusWriter(person.card, disk, 0.0)
+        status_writer.report(None, True, lambda: b"streaming", 0.0)
+        status_writer.report(None, True, lambda: b"streaming", SETTLED_S)
     assert disk.count == 1
 
 
 def test_a_boot_partition_that_is_not_there_is_said_once(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    teller = Teller(light.Card(tmp_path), FastDisk(), 0.0)
+    status_writer = StatusWriter(light.Card(tmp_path), FastDisk(), 0.0)
     for fault in status.ALL:
-        teller.report(fault, False, lambda: b"", 0.0)
-        teller.report(fault, False, lambda: b"", SETTLED_S)
+        status_writer.report(fault, False, lambda: b"", 0.0)
+        status_writer.report(fault, False, lambda: b"", SETTLED_S)
     assert (
         capsys.readouterr().err == f"light: STATUS.txt: {tmp_path}/boot/firmware/blimp: not there\n"
     )
