@@ -120,7 +120,8 @@ def carry_out(plan: Plan, store: Store, data: Path, jobs: int, do: Work = work) 
     """Does what is not there yet, `jobs` at a time, each by `do`; the number of jobs done.
 
     Raises the first error that a person can fix, after the others in hand are finished; what was
-    done is kept. A job that its process did not survive is kept as failed.
+    done is kept. A job that its process did not survive, or that a defect of the program ended, is
+    kept as failed.
     """
     open_ = {key: job for key, job in plan.jobs.items() if not store.done(job)}
     _spread_failures(plan, store, open_)
@@ -171,10 +172,12 @@ def _until_broken(
                 broken = True
                 if tries[key] < _TRIES:
                     continue
-                _fail(store, open_[key])
+                _fail(store, open_[key], f"its process ended {_TRIES} times")
             except BlimpError as caught:
                 error = error or caught
                 continue
+            except Exception as caught:  # a defect of the program's own: the others go on
+                _fail(store, open_[key], f"{type(caught).__name__}: {caught}")
             del open_[key]
             done += 1
             progress.step()
@@ -186,10 +189,10 @@ def _until_broken(
     return done
 
 
-def _fail(store: Store, job: Job) -> None:
+def _fail(store: Store, job: Job, reason: str) -> None:
     if isinstance(job, FlightJob):  # nothing can go on without it
-        raise GroundStationError(f"{job.name}: its process ended {_TRIES} times")
-    store.write(job.key, {"failed": f"its process ended {_TRIES} times", "accident": True})
+        raise GroundStationError(f"{job.name}: {reason}")
+    store.write(job.key, {"failed": reason, "accident": True})
 
 
 def _spread_failures(plan: Plan, store: Store, open_: dict[str, Job]) -> None:

@@ -83,6 +83,12 @@ def dies(job, folder: Path, data: Path) -> None:
     note(job, folder, data)
 
 
+def defective(job, folder: Path, data: Path) -> None:
+    if isinstance(job, RunJob) and job.seed == 1:
+        raise ZeroDivisionError("division by zero")
+    note(job, folder, data)
+
+
 def slow(job, folder: Path, data: Path) -> None:
     if isinstance(job, RunJob):
         (folder / f"begun-{job.key}").touch()
@@ -142,6 +148,13 @@ def test_a_process_that_dies_costs_its_neighbours_nothing_and_at_the_second_try_
         "failed": "its process ended 2 times",
         "accident": True,
     }
+
+
+def test_a_defect_of_the_program_costs_its_own_job_and_is_an_accident(tmp_path):
+    carry_out(a_plan(), Store(tmp_path), tmp_path, 2, defective)
+    assert sorted(done(tmp_path)) == ["f", "m", "r0", "r2"]
+    failed = {"failed": "ZeroDivisionError: division by zero", "accident": True}
+    assert Store(tmp_path).read("r1") == failed
 
 
 def test_an_interrupt_ends_the_workers_and_keeps_what_was_done(tmp_path):

@@ -363,8 +363,11 @@ def _thinned(model: Model) -> Model:
         kept = np.zeros(len(model.position), dtype=bool)
         kept[np.arange(0, len(kept), every).astype(np.int64)] = True
         model = without_points(model, ~kept)
-    enough = np.bincount(model.image, minlength=len(model.names)) >= _FEWEST_OBSERVATIONS
-    return model if enough.all() else among(model, enough)
+    while True:  # points go with an image, and another may have held by these
+        enough = np.bincount(model.image, minlength=len(model.names)) >= _FEWEST_OBSERVATIONS
+        if enough.all():
+            return model
+        model = among(model, enough)
 
 
 def _robust_sigma(residuals: F64) -> float:

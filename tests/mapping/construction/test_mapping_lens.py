@@ -169,6 +169,20 @@ def test_a_point_at_a_camera_s_centre_changes_nothing():
     assert with_it.explained == pytest.approx(without.explained, abs=0.002)
 
 
+def test_an_image_that_held_by_one_that_is_left_out_goes_with_it():
+    images, model = _views(CAMERA, *_flight(True, 1), 1)
+    model = lens._as_seen(model, images, CAMERA, 0.0)
+    first, second = (set(model.point[model.image == k].tolist()) for k in (8, 9))
+    own = sorted(first & second)[:12]  # the second sees one fewer of them: too few
+    ours = np.isin(model.point, own)
+    rows = ours == np.isin(model.image, [8, 9])
+    rows &= ~((model.image == 9) & (model.point == own[-1]))
+    prior = lens.prior_of(LensPrior(CAMERA, "file", 0.0), CAMERA)
+    others = among(_with_rows(model, rows), ~np.isin(np.arange(len(model.names)), [8, 9]))
+    found, without = (adjust(each, CAMERA, prior) for each in (_with_rows(model, rows), others))
+    assert found is not None and vector(found.camera) == pytest.approx(vector(without.camera))
+
+
 def test_the_covariance_holds_over_many_flights():
     """Of 12 flights the mean square of the focal length's error in sigmas is that of a sigma."""
     off = []
