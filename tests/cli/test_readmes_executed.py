@@ -33,6 +33,8 @@ from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.recording.frames import Frame
 from ground_station.recording.open import open_input
 from ground_station.replay.cases.outcome import write_outcome
+from ground_station.simulator import simulate as flights
+from ground_station.simulator.lighting import lit_scene
 from hw.__main__ import main as hw
 
 ATRIUM = ROOT / "maps/atrium"
@@ -56,6 +58,7 @@ ELSEWHERE = {
     "make soak-stream": OWN,
     "make limits": OWN,
     "make sample": OWN,
+    "make budget": "tests/hw/test_hw_command.py",
     "make lock": "asks the network for the newest packages",
     "blimp experiments": "tests/experiments/test_experiments_whole.py, by a file of its own",
     "blimp models import superpoint_v1.pth": NOT_OURS,
@@ -178,7 +181,8 @@ def test_every_command_of_a_page_does_what_it_is_there_for(
     (tmp_path / "maps/atrium").symlink_to(ATRIUM)  # of every checkout
     for give in GIVEN.get(name, []):
         give(tmp_path)
-    with quick_light():
+    with quick_light() as patch:
+        patch.setattr(flights, "lit_scene", lambda scene, _, light: lit_scene(scene, 25.0, light))
         for words in here(NAMES[name]):
             if name == "ground_station/simulator/README.md" and words[:2] == ["blimp", "calibrate"]:
                 film_of_a_board(tmp_path)  # a simulated one takes minutes

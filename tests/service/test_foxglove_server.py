@@ -442,7 +442,7 @@ def test_what_clients_make_the_sdk_say_is_said_once_a_minute() -> None:
 
 def test_nothing_is_built_that_nobody_wants() -> None:
     topic = json_topic("/a", {}, Context())
-    topic.say(lambda: pytest.fail("built for nobody"), 1)
+    topic.publish(lambda: pytest.fail("built for nobody"), 1)
 
 
 def test_a_full_inbox_loses_the_oldest() -> None:
