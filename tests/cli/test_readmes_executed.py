@@ -60,6 +60,7 @@ ELSEWHERE = {
     "make sample": OWN,
     "make budget": "tests/hw/test_hw_command.py",
     "make lock": "asks the network for the newest packages",
+    "blimp serve --lan": "tests/deploy/flash/test_flash_lan.py: a flashed card reaches it",
     "blimp experiments": "tests/experiments/test_experiments_whole.py, by a file of its own",
     "blimp models import superpoint_v1.pth": NOT_OURS,
     "blimp map build walk.mcap --features superpoint": NOT_OURS,
