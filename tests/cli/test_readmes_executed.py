@@ -173,7 +173,7 @@ def test_what_is_executed_elsewhere_is_of_a_page_and_what_is_given_is_needed() -
 
 
 @pytest.mark.parametrize("name", sorted(NAMES))
-def test_every_command_of_a_page_does_what_it_is_there_for(
+def test_every_command_of_a_page_is_executed(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
