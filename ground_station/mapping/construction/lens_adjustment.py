@@ -8,11 +8,12 @@ Vision Algorithms 1999, section 6). Key points are the distorted ones, as they w
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
-from scipy.sparse import bsr_array, csr_array, vstack
+from scipy.sparse import bsr_array, csr_array
 from scipy.spatial.transform import Rotation
 
 from ground_station.arrays import F64, I64
@@ -134,14 +135,16 @@ class _State:
 class _Normal:
     """The normal equations without the points, and what gives the points back.
 
-    `S` (P + 9, P + 9) and `g` (P + 9,), P free pose parameters; `V_inv` (M, 3, 3), `W` the
-    (P + 9, 3 M) block between cameras and points, `g_points` (M, 3).
+    `S` (P + 9, P + 9) and `g` (P + 9,), P free pose parameters; `V_inv` (M, 3, 3); `W`
+    (6 K, 3 M), of all poses' parameters, and `L` (3 M, 9) are the blocks between points and these;
+    `g_points` (M, 3).
     """
 
     S: F64
     g: F64
     V_inv: F64
-    W: csr_array
+    W: bsr_array
+    L: F64
     g_points: F64
 
 
@@ -153,9 +156,6 @@ class _Problem:
         self._images, self._points = len(model.names), len(model.position)
         observations = np.arange(len(model.image))
         ones = np.ones(len(observations))
-        self._by_image = csr_array(
-            (ones, (model.image, observations)), (self._images, len(observations))
-        )
         self._by_point = csr_array(
             (ones, (model.point, observations)), (self._points, len(observations))
         )
@@ -219,8 +219,8 @@ class _Problem:
         r, weight, Jl, Jp, Jx = self._linear(state, scale_px)
         full = np.zeros((self._images * 6, 9))
         full[self._free] = nuisance
-        lens_point = equations.W[P:] - nuisance.T @ equations.W[:P]
-        B = np.einsum("mij,mjl->mil", equations.V_inv, lens_point.T.reshape(-1, 3, 9))
+        lens_point = equations.L - equations.W.T @ full
+        B = equations.V_inv @ lens_point.reshape(-1, 3, 9)
         pull = Jl - Jp @ full.reshape(-1, 6, 9)[self._image] - Jx @ B[self._point]
         score = np.einsum("o,oki,ok->oi", weight, pull, r)
         # The variance of what a robust estimate's equations are made of (Huber 1964).
@@ -283,52 +283,50 @@ class _Problem:
 
     def _equations(self, state: _State, scale_px: float, damping: float) -> _Normal:
         r, weight, Jl, Jp, Jx = self._linear(state, scale_px)
-        K, M, P = self._images, self._points, len(self._free)
-        wJl, wJp, wJx = (J * weight[:, None, None] for J in (Jl, Jp, Jx))
-        U, V = _sums(self._by_image, wJp, Jp), _sums(self._by_point, wJx, Jx)
-        corner = np.einsum("oki,okj->ij", wJl, Jl)
+        K, M = self._images, self._points
+        shared = np.concatenate([Jl, r[:, :, None]], axis=2)
+        J = np.concatenate([Jp, shared], axis=2).reshape(-1, 16)
+        wJ, wJx = J * np.repeat(weight, 2)[:, None], Jx * weight[:, None, None]
+        images = np.array([wJ[i:j].T @ J[i:j] for i, j in itertools.pairwise(2 * self._rows)])
+        blocks = np.einsum("oki,okj->oij", wJx, np.concatenate([Jx, shared], axis=2))
+        points = np.asarray(self._by_point @ blocks.reshape(-1, 39)).reshape(M, 3, 13)
+        U, V, corner = images[:, :6, :6], points[:, :, :3], images[:, 6:15, 6:15].sum(axis=0)
         for block in (U, V, corner[None]):
             diagonal = np.arange(block.shape[1])
             block[:, diagonal, diagonal] *= 1 + damping
         V[:, range(3), range(3)] += 1e-12 * np.trace(V, axis1=1, axis2=2)[:, None]
-        information = self._variance(scale_px) * self._prior_information
-        H = np.zeros((P + 9, P + 9))
-        H[:P, :P] = block_diag(*U)[np.ix_(self._free, self._free)]
-        H[:P, P:] = _sums(self._by_image, wJp, Jl).reshape(6 * K, 9)[self._free]
-        H[P:, :P], H[P:, P:] = H[:P, P:].T, corner + information
-        blocks = np.einsum("oki,okj->oij", wJp, Jx)
-        poses = bsr_array((blocks, self._point, self._rows), shape=(6 * K, 3 * M)).tocsr()
-        lens = csr_array(_sums(self._by_point, wJx, Jl).reshape(3 * M, 9).T)
-        W = csr_array(vstack([poses[self._free], lens]))
         V_inv = np.asarray(np.linalg.inv(V), np.float64)
-        inverse = bsr_array((V_inv, np.arange(M), np.arange(M + 1)), shape=(3 * M, 3 * M))
-        WV = W @ inverse.tocsr()
-        g_pose = (self._by_image @ np.einsum("oki,ok->oi", wJp, r)).ravel()[self._free]
-        g_lens = np.einsum("oki,ok->i", wJl, r) + information @ (state.lens - self._prior_mean)
-        g_points = np.asarray(self._by_point @ np.einsum("oki,ok->oi", wJx, r))
-        S = H - (WV @ W.T).toarray()
-        g = np.concatenate([g_pose, g_lens]) - WV @ g_points.ravel()
-        return _Normal(S, g, V_inv, W, g_points)
+        blocks = np.einsum("oki,okj->oij", wJ[:, :6].reshape(-1, 2, 6), Jx)
+        W, WV = (
+            bsr_array((one, self._point, self._rows), shape=(6 * K, 3 * M))
+            for one in (blocks, blocks @ V_inv[self._point])
+        )
+        L, g_points = points[:, :, 3:12].reshape(3 * M, 9), points[:, :, 12]
+        VL = (V_inv @ points[:, :, 3:12]).reshape(3 * M, 9)
+        information = self._variance(scale_px) * self._prior_information
+        S = np.empty((6 * K + 9, 6 * K + 9))
+        S[:-9, :-9] = block_diag(*U) - (WV @ W.T).toarray()
+        S[:-9, -9:] = images[:, :6, 6:15].reshape(6 * K, 9) - W @ VL
+        S[-9:, :-9], S[-9:, -9:] = S[:-9, -9:].T, corner + information - L.T @ VL
+        g_lens = images[:, 6:15, 15].sum(axis=0) + information @ (state.lens - self._prior_mean)
+        g = np.append(images[:, :6, 15], g_lens) - np.append(
+            WV @ g_points.ravel(), g_points.ravel() @ VL
+        )
+        kept = np.append(self._free, np.arange(6 * K, 6 * K + 9))
+        return _Normal(S[np.ix_(kept, kept)], g[kept], V_inv, W, L, g_points)
 
     def _step(self, state: _State, equations: _Normal) -> _State:
-        P = len(self._free)
         step = -cho_solve(cho_factor(equations.S), equations.g)
-        left = equations.g_points + (equations.W.T @ step).reshape(-1, 3)
-        points = state.points - np.einsum("mij,mj->mi", equations.V_inv, left)
         motion = np.zeros(6 * self._images)
-        motion[self._free] = step[:P]
+        motion[self._free] = step[:-9]
+        pulled = equations.W.T @ motion + equations.L @ step[-9:]
+        left = equations.g_points + pulled.reshape(-1, 3)
+        points = state.points - np.einsum("mij,mj->mi", equations.V_inv, left)
         w, t = motion.reshape(-1, 6)[:, :3], motion.reshape(-1, 6)[:, 3:]
         cTw = state.cTw.copy()
         cTw[:, :, :3] = Rotation.from_rotvec(w).as_matrix() @ cTw[:, :, :3]
         cTw[:, :, 3] += t
-        return _State(state.lens + step[P:], cTw, points)
-
-
-def _sums(groups: csr_array, first: F64, second: F64) -> F64:
-    """Of firstᵀ second, (O, 2, A) and (O, 2, B), over each group of observations."""
-    blocks = np.einsum("oki,okj->oij", first, second)
-    summed = np.asarray(groups @ blocks.reshape(len(blocks), -1))
-    return summed.reshape(-1, *blocks.shape[1:])
+        return _State(state.lens + step[-9:], cTw, points)
 
 
 def _once(model: Model) -> Model:
