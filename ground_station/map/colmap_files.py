@@ -12,9 +12,6 @@ from __future__ import annotations
 import zlib  # noqa: F401  # isort: skip
 import cv2  # noqa: F401  # isort: skip
 
-import os
-import resource
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -33,7 +30,8 @@ _SECONDS_MB, _TIMES = 1.0, 50
 
 def check(folder: Path) -> None:
     """Raises `MapError` with one line where a model is not one that COLMAP reads as it stands."""
-    from ground_station.errors import MapError  # the child needs none of it
+    from ground_station import bounded  # the child needs none of it
+    from ground_station.errors import MapError
     from pi_firmware.wire.text import printable
 
     if not folder.is_dir():
@@ -41,25 +39,18 @@ def check(folder: Path) -> None:
     for path in sorted(folder.iterdir()):
         if not (path.is_file() or path.is_dir()):  # a pipe would be waited for without end
             raise MapError(f"{path}: neither a file nor a folder: what is a model's is a file")
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # each thread claims memory
-    child = [sys.executable, "-I", __file__, str(folder.absolute()), str(_SECONDS)]
-    run = subprocess.run(child, capture_output=True, text=True, errors="replace", env=environment)
-    fault = (run.stdout.strip().splitlines() or [""])[-1]
+    size = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
+    run = bounded.run(
+        Path(__file__),
+        str(folder.absolute()),
+        seconds=_SECONDS + _SECONDS_MB * size / 1e6,
+        memory_bytes=_BYTES + _TIMES * size,
+    )
+    fault = (run.stdout.decode(errors="replace").strip().splitlines() or [""])[-1]
     if run.returncode:
         fault = f"COLMAP's reader does not end well with it (status {run.returncode})"
     if fault:
         raise MapError(f"{folder}: not a COLMAP model: {printable(fault, 200)}")
-
-
-def _bound(folder: Path, least_s: float) -> None:
-    size = sum(path.stat().st_size for path in folder.iterdir() if path.is_file())
-    seconds = int(least_s + _SECONDS_MB * size / 1e6)
-    for what, limit in (
-        (resource.RLIMIT_CPU, seconds),
-        (resource.RLIMIT_AS, _BYTES + _TIMES * size),
-        (resource.RLIMIT_CORE, 0),
-    ):
-        resource.setrlimit(what, (limit, limit))
 
 
 def _look(folder: Path) -> str:
@@ -119,7 +110,6 @@ def _content(path: Path) -> tuple[list[str], npt.NDArray[np.float64]]:
 
 
 if __name__ == "__main__":
-    _bound(Path(sys.argv[1]), float(sys.argv[2]))
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     try:
         print(_look(Path(sys.argv[1])))

@@ -34,7 +34,7 @@ READERS = (
     Reader("video", "raw H.264 and video containers", 8192),
     Reader("maps", "map.toml, landmarks and keyframes"),
     Reader("observations", "a flight's observations for the refinement"),
-    Reader("weights", "weights of torch and safetensors, and networks built from them", 8192),
+    Reader("weights", "weights of safetensors, and networks built from them", 8192),
     Reader("model", "learned models: ONNX files", 32768),
     Reader("floorplan", "floorplan.yaml and its picture"),
     Reader("image", "image files"),
