@@ -14,7 +14,6 @@ from deploy.errors import DeployError, Interrupted
 from deploy.flash import customise, disks, image, keys, wishes, write
 from deploy.flash.boot import BootPartition
 from deploy.flash.customise import Content
-from deploy.flash.disks import Disk, Machine
 from deploy.flash.write import Target
 from deploy.provisioning.model import Provisioning
 
@@ -83,7 +82,7 @@ def _run(options: argparse.Namespace) -> None:
     device = options.device
     if not options.customise_only:
         _needed(options)
-    disk = disks.find(Machine(), device)
+    disk = disks.find(device)
     if options.customise_only:
         with Target.open(device) as target:
             boot = BootPartition.find(target.fileno(), str(device))
@@ -186,7 +185,9 @@ def _ssh_keys(
     return None
 
 
-def _confirm(options: argparse.Namespace, disk: Disk | None, target: Target, what: str) -> None:
+def _confirm(
+    options: argparse.Namespace, disk: disks.Entry | None, target: Target, what: str
+) -> None:
     """Shows the device and lets its name be typed; raises `DeployError` when it is another one."""
     print(disks.describe(target.path, disk, target.size), flush=True)
     if options.yes:

@@ -2,114 +2,118 @@
 
 from __future__ import annotations
 
+import json
 import os
 import stat
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
-import machines
 import pytest
 from card_bench import Bench, refused, tool
 
 from deploy.errors import DeployError
 from deploy.flash import disks
-from deploy.flash.disks import Machine
+from deploy.flash.disks import Entry
 from deploy.flash.write import Target
 
+
+def entry(name: str, kind: str = "disk", *upon: Entry, **facts: Any) -> Entry:
+    """A device as lsblk shows it: a card of 31.9 GB in a reader, where nothing else is said."""
+    usual = {"size": 31_900_000_000, "rm": kind == "disk", "ro": False, "vendor": "Generic ",
+             "model": "STORAGE DEVICE", "serial": None, "fstype": None, "label": None,
+             "mountpoints": [None]}  # fmt: skip
+    found = {"name": name, "kname": name, "type": kind, **usual, **facts}
+    return found | {"children": list(upon)} if upon else found
+
+
+def part(name: str, point: str | None = None, *upon: Entry, **facts: Any) -> Entry:
+    return entry(name, "part", *upon, mountpoints=[point], **facts)
+
+
+LUKS = entry("luks", "crypt", entry("vg-root", "lvm", mountpoints=["/"]), entry("vg-home", "lvm"))
 REFUSED = [
-    (machines.laptop, "nvme0n1", "this machine runs on it (dm-1 is mounted on /)"),
-    (machines.laptop, "sdc", "Portable SSD, 1.0 TB, is a fixed disk"),
-    (machines.laptop, "sdd", "in use: sdd1 is mounted on /media/pilot/MY PHOTOS"),
-    (machines.laptop, "sde", "in use: sde1 is held by dm-3 (backup)"),
-    (machines.laptop, "sdf", "no card in it"),
-    (machines.laptop, "sdg", "write-protected"),
-    (machines.laptop, "sdh", "in use: sdh1 is mounted on /srv"),
-    (machines.laptop, "sdi", "this machine runs on it (/dev/sdi1 is swap space)"),
-    (machines.laptop, "sr0", "not a disk"),
-    (machines.laptop, "mmcblk1", "is a fixed disk"),
-    (machines.laptop, "loop0", "is a fixed disk"),
-    (machines.laptop, "dm-3", "is a fixed disk"),
-    (machines.live_stick, "sda", "this machine runs on it (loop0 is mounted on /)"),
-    (machines.pi, "mmcblk0", "this machine runs on it (mmcblk0p2 is mounted on /)"),
-]
+    (entry("nvme0n1", "disk", part("nvme0n1p1", "/boot/efi"), part("nvme0n1p3", None, LUKS)),
+     "this machine runs on it (nvme0n1p1 is mounted on /boot/efi)"),
+    (entry("nvme0n1", "disk", part("nvme0n1p3", None, LUKS)),
+     "this machine runs on it (vg-root is mounted on /)"),
+    (entry("sdb", "disk", part("sdb1", "/srv"), part("sdb2", "/")),
+     "this machine runs on it (sdb2 is mounted on /)"),
+    (entry("sdc", size=10**12, rm=False, vendor=None, model="Portable SSD"),
+     "Portable SSD, 1.0 TB, is a fixed disk"),
+    (entry("sdd", "disk", part("sdd1", "/media/pilot/MY PHOTOS")),
+     "in use: sdd1 is mounted on /media/pilot/MY PHOTOS"),
+    (entry("sde", "disk", part("sde1", None, entry("backup", "crypt"))),
+     "in use: sde1 is held by backup"),
+    (entry("sdf", size=0), "no card in it"),
+    (entry("sdg", ro=True), "write-protected"),
+    (entry("sdh", mountpoints=["/srv"]), "in use: sdh is mounted on /srv"),
+    (entry("sdi", "disk", part("sdi1", "[SWAP]")),
+     "this machine runs on it (sdi1 is swap space)"),
+    (entry("sr0", "rom", rm=True, vendor="DVD", model="RW"), "DVD RW: not a disk"),
+    (entry("loop0", "loop"), "is a fixed disk"),
+    (entry("dm-3", "crypt"), "is a fixed disk"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(("make", "name", "said"), REFUSED, ids=lambda value: str(value)[:9])
-def test_it_refuses(tmp_path: Path, make: Callable[[Path], object], name: str, said: str) -> None:
-    make(tmp_path)
-    machine = Machine(tmp_path)
+@pytest.mark.parametrize(("disk", "said"), REFUSED, ids=lambda value: str(value)[:9])
+def test_it_refuses(disk: Entry, said: str) -> None:
     with pytest.raises(DeployError) as caught:
-        disks.check(machine, machine.disk(name))
-    assert str(caught.value).startswith(f"/dev/{name}: ") and said in str(caught.value)
+        disks.check(disk)
+    assert str(caught.value).startswith(f"/dev/{disk['name']}: ") and said in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("make", "name"),
-    [(machines.laptop, "sdb"), (machines.laptop, "mmcblk0"), (machines.pi, "sda")],
-)
-def test_it_takes_a_card_in_a_reader(
-    tmp_path: Path, make: Callable[[Path], object], name: str
-) -> None:
-    make(tmp_path)
-    machine = Machine(tmp_path)
-    disks.check(machine, machine.disk(name))
-
-
-def test_it_shows_what_a_person_knows_a_card_by(tmp_path: Path) -> None:
-    machines.laptop(tmp_path)
-    machine = Machine(tmp_path)
-    disk = machine.disk("sdb")
-    assert disks.describe(Path("/dev/sdb"), disk, disk.size_bytes).splitlines() == [
-        "/dev/sdb: Generic STORAGE DEVICE, 31.9 GB, serial 000000001206",
-        "  sdb1: 270 MB vfat BLIMPBOOT",
-        "  sdb2: 2.1 GB ext4 blimp-root",
-    ]
-    shown = disks.describe(Path("/dev/mmcblk0"), machine.disk("mmcblk0"), 1)
+def test_it_takes_a_card_in_a_reader_or_a_built_in_slot(tmp_path: Path) -> None:
+    disks.check(entry("sdb", "disk", part("sdb1"), part("sdb2")))
+    slot = entry("mmcblk0", rm=False, vendor=None, model=None, serial="0x12ab34cd")
+    (tmp_path / "device").mkdir()
+    (tmp_path / "device/name").write_text("SC32G\n")
+    for kind in ("MMC", "SD"):  # eMMC is soldered to the board
+        (tmp_path / "device/type").write_text(f"{kind}\n")
+        found = disks.completed(slot, tmp_path)
+        with pytest.raises(DeployError) if kind == "MMC" else nullcontext():
+            disks.check(found)
+    shown = disks.describe(Path("/dev/mmcblk0"), found, 1)
     assert shown == "/dev/mmcblk0: SC32G, 31.9 GB, serial 0x12ab34cd\n  no partitions"
 
 
-def test_a_disk_cannot_write_on_the_terminal(tmp_path: Path) -> None:
-    tree = machines.Tree(tmp_path)
-    tree.disk("sdb", "8:16", 1, removable=1, model="evil\x1b[2J", type="0")
-    assert "\x1b" not in disks.describe(Path("/dev/sdb"), Machine(tmp_path).disk("sdb"), 1)
+def test_it_shows_what_a_person_knows_a_card_by() -> None:
+    boot = part("sdb1", size=270_000_000, fstype="vfat", label="BLIMPBOOT")
+    root = part("sdb2", size=2_100_000_000, fstype="ext4", label="evil\x1b[2J")
+    disk = entry("sdb", "disk", boot, root, serial="000000001206")
+    assert disks.describe(Path("/dev/sdb"), disk, disk["size"]).splitlines() == [
+        "/dev/sdb: Generic STORAGE DEVICE, 31.9 GB, serial 000000001206",
+        "  sdb1: 270 MB vfat BLIMPBOOT",
+        "  sdb2: 2.1 GB ext4 evil?[2J",
+    ]
 
 
-def test_a_partition_is_named_with_its_disk(tmp_path: Path) -> None:
-    machines.laptop(tmp_path / "tree")
-    machine = Machine(tmp_path / "tree")
-    assert machine.whole("sdb1") == "sdb" and machine.whole("mmcblk0") == "mmcblk0"
+def test_a_partition_is_named_with_its_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     node = tmp_path / "node"
-    try:  # only its number is looked at; there is no such device here
-        os.mknod(node, stat.S_IFBLK | 0o600, os.makedev(8, 17))
+    try:  # lsblk's answer is laid out: there is no such device here
+        os.mknod(node, stat.S_IFBLK | 0o600, os.makedev(8, 208))
     except PermissionError:
         pytest.skip("only root makes device nodes")
+    with pytest.raises(DeployError, match="lsblk: "):
+        disks.find(node)
+    said = json.dumps({"blockdevices": [part("sdb1", pkname="sdb")]}).encode()
+    monkeypatch.setattr(disks, "run", lambda words: said)
     with pytest.raises(DeployError, match="a partition; name the whole disk, /dev/sdb"):
-        disks.find(machine, node)
-    other = tmp_path / "other"
-    os.mknod(other, stat.S_IFBLK | 0o600, os.makedev(8, 208))
-    with pytest.raises(DeployError, match="knows no such disk"):
-        disks.find(machine, other)
-
-
-def test_a_file_that_a_loop_shows_is_in_use(tmp_path: Path) -> None:
-    card = tmp_path / "card.img"
-    card.touch()
-    tree = machines.Tree(tmp_path / "tree")
-    tree.loop("loop3", "7:3", str(card.resolve()))
-    with pytest.raises(DeployError, match="in use as loop3"):
-        disks.find(Machine(tmp_path / "tree"), card)
+        disks.find(node)
 
 
 def test_the_disk_that_this_machine_runs_on_is_refused() -> None:
     """The real one, by its facts alone: it is not opened."""
-    number = Path("/").stat().st_dev
-    machine = Machine()
-    name = machine.name_of(os.major(number), os.minor(number))
-    if name is None:
+    said = subprocess.run(["findmnt", "-no", "SOURCE", "/"], capture_output=True, text=True)
+    source = Path(said.stdout.strip() or "/none")
+    if not source.is_block_device():
         pytest.skip("this system's root is on no block device of its own (a container)")
-    with pytest.raises(DeployError, match="this machine runs on it"):
-        disks.check(machine, machine.disk(machine.whole(name)))
+    with pytest.raises(DeployError, match=r"this machine runs on it|a partition; name"):
+        disks.find(source)
 
 
 def test_the_program_says_what_is_no_card(bench: Bench) -> None:
@@ -150,13 +154,15 @@ def test_a_real_device_that_is_mounted_or_fixed_is_refused(
     words = [device if word == str(bench.card) else word for word in bench.command()]
     refused(words, "is a fixed disk (not removable)")
     refused([*bench.customise()[:-1], "--device", device], "is a fixed disk")
+    name = Path(device).name
+    refused([str(file) if word == device else word for word in words], f"in use as /dev/{name}")
     point = bench.folder / "mounted here"
     point.mkdir()
     mounted = subprocess.run(["mount", "-o", "ro", device, point], check=False)
     if mounted.returncode:
         pytest.skip("mounting is not allowed here")
     try:
-        refused(words, f"in use: {Path(device).name} is mounted on {point}", program=True)
+        refused(words, f"in use: {name} is mounted on {point}", program=True)
         # The last line of defence: the kernel itself.
         with pytest.raises(DeployError, match="in use by the system or another program"):
             Target.open(Path(device))
