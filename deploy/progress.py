@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 import time
 
-_BAR_EVERY_S, _LINE_EVERY_S = 0.1, 10.0
-_BAR_WIDTH = 20
+from tqdm import tqdm
+
+_LINE_EVERY_S = 10.0
 
 
 class Progress:
@@ -16,47 +16,28 @@ class Progress:
     def __init__(self, label: str, total: int) -> None:
         self._label, self._total, self._done = label, total, 0
         self._start_s = self._said_s = time.monotonic()
-        self._terminal = sys.stderr.isatty()
+        # Without a terminal there is no bar (disable=None).
+        self._bar = tqdm(
+            total=total, desc=label, unit="B", unit_scale=True, leave=False, disable=None
+        )
 
     def advance(self, size: int) -> None:
         """So many bytes more are done."""
         self._done += size
-        now_s = time.monotonic()
-        if now_s - self._said_s >= (_BAR_EVERY_S if self._terminal else _LINE_EVERY_S):
-            self._said_s = now_s
-            self._write_line(now_s - self._start_s)
+        self._bar.update(size)
+        if self._bar.disable and time.monotonic() - self._said_s >= _LINE_EVERY_S:
+            self._said_s = time.monotonic()
+            self._say(f"of {self._total / 1e6:.1f} MB")
 
-    def _write_line(self, elapsed_s: float) -> None:
-        share = self._done / self._total if self._total else 1.0
-        rate = self._done / max(elapsed_s, 1e-6)
-        rest_s = (self._total - self._done) / rate if rate else 0.0
-        figures = f"{_mega(self._done)} of {_mega(self._total)} MB, {_mega(rate)} MB/s"
-        left = f"{int(rest_s) // 60}:{int(rest_s) % 60:02d} left"
-        if not self._terminal:
-            self._write(f"{self._label}: {figures}, {left}\n")
-            return
-        bar = ("#" * int(share * _BAR_WIDTH)).ljust(_BAR_WIDTH, ".")
-        line = f"{self._label} [{bar}] {share:4.0%}  {figures}, {left}"
-        self._write("\r" + line[: shutil.get_terminal_size().columns - 1] + "\x1b[K")
+    def _say(self, what: str) -> None:
+        elapsed_s = time.monotonic() - self._start_s
+        rate = self._done / 1e6 / max(elapsed_s, 1e-6)
+        figures = f"{self._done / 1e6:.1f} {what} in {elapsed_s:.1f} s ({rate:.1f} MB/s)"
+        print(f"{self._label}: {figures}", file=sys.stderr, flush=True)
 
     def __enter__(self) -> Progress:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        clear = "\r\x1b[K" if self._terminal else ""
-        elapsed_s = time.monotonic() - self._start_s
-        rate = _mega(self._done / max(elapsed_s, 1e-6))
-        end = "" if kind is None else ", not finished"
-        self._write(
-            f"{clear}{self._label}: {_mega(self._done)} MB in {elapsed_s:.1f} s"
-            f" ({rate} MB/s){end}\n"
-        )
-
-    @staticmethod
-    def _write(text: str) -> None:
-        sys.stderr.write(text)
-        sys.stderr.flush()
-
-
-def _mega(size: float) -> str:
-    return f"{size / 1e6:.1f}" if size < 100e6 else f"{size / 1e6:.0f}"
+        self._bar.close()
+        self._say("MB" if kind is None else "MB, not finished")

@@ -14,6 +14,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any
 
+from tqdm.utils import CallbackIOWrapper
+
 from deploy.board.inputs import digest
 from deploy.board.releases import manifest
 from deploy.board.releases.choose import MANIFEST, RELEASE
@@ -124,19 +126,6 @@ def size_to_send(bundle: Bundle, held: Mapping[str, str]) -> int:
     return sum(file.size for file in bundle.listed.files if held.get(file.path) != file.sha256)
 
 
-class _Counted(io.BytesIO):
-    """Tells what is read of it."""
-
-    def __init__(self, data: bytes, read: Callable[[int], None]) -> None:
-        super().__init__(data)
-        self._read = read
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        data = super().read(size)
-        self._read(len(data))
-        return data
-
-
 def _add(
     tar: tarfile.TarFile,
     path: str,
@@ -146,7 +135,7 @@ def _add(
     member = tarfile.TarInfo(path)
     member.size, member.mode = len(data), 0o644  # no owner, no time: nothing of this machine
     try:
-        tar.addfile(member, _Counted(data, wrote))
+        tar.addfile(member, CallbackIOWrapper(wrote, io.BytesIO(data), "read"))
     except ValueError:
         raise DeployError(f"{path}: its name is too long for a bundle") from None
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shlex
 import subprocess
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -25,6 +25,7 @@ _PROGRAM = (
 _ASK_S = 60.0
 _END_S = 900.0  # writing, reading back and compiling on a slow board
 _POLL_S = 3.0
+_MOST_BYTES = 1 << 20  # of an answer
 _MOST_TRIES = 3  # MaxAuthTries of the card's sshd
 _SLACK_S = 60.0  # a payload whose radio comes back late
 _OPTIONS = (
@@ -107,36 +108,25 @@ class Card:
         Raises `DeployError` with the card's own reason when it refuses, and when the link breaks:
         then the card is as it was, or tries the release out, which `status` tells.
         """
-        process = subprocess.Popen(
-            self._command("receive", *(["--force"] if force else [])),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-        assert process.stdin and process.stdout and process.stderr
-        said = [b"", b""]
-        readers = [
-            threading.Thread(target=_drain, args=(pipe, said, at))
-            for at, pipe in enumerate((process.stdout, process.stderr))
-        ]
-        try:
-            for reader in readers:
-                reader.start()
+        words = self._command("receive", *(["--force"] if force else []))
+        with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+            process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=out, stderr=err)
+            assert process.stdin
             try:
-                bundles.write(bundle, process.stdin, held, wrote)
-                process.stdin.close()
-            except (BrokenPipeError, ConnectionResetError):
-                pass  # it refused in the midst: its own words are the reason
-            process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            raise DeployError(f"{self.host}: the card did not end within {_END_S:g} s") from None
-        finally:
-            if process.poll() is None:
+                # One that refuses in the midst reads no further: its own words are the reason.
+                with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                    bundles.write(bundle, process.stdin, held, wrote)
+                    process.stdin.close()
+                process.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                limit = f"within {_END_S:g} s"
+                raise DeployError(f"{self.host}: the card did not end {limit}") from None
+            finally:
                 process.kill()
                 process.wait()
-            for reader in readers:
-                reader.join()
-        return self._answer(process.returncode, said[0], said[1])
+            out.seek(0)
+            err.seek(0)
+            return self._answer(process.returncode, out.read(_MOST_BYTES), err.read(_MOST_BYTES))
 
     def follow(
         self,
@@ -198,10 +188,3 @@ class Card:
         if last.startswith("releases: "):
             return f"{self.name} refuses: {last.removeprefix('releases: ')}"
         return f"{self.host}: {last or f'ssh ended with status {status}'}"
-
-
-def _drain(pipe: Any, said: list[bytes], at: int) -> None:
-    """Reads a pipe to its end and keeps a bounded part, so that the other side never waits."""
-    with pipe:
-        while data := pipe.read(1 << 16):
-            said[at] = (said[at] + data)[-(1 << 16) :]
