@@ -4,9 +4,9 @@ Nothing is written before the list's signature is good, and nothing is switched 
 was read back from the card. A stream that ends early, or a full card, leaves all as it was.
 
 The stream is a tar, POSIX ustar (IEEE 1003.1, pax utility): 512-byte headers, content filled up to
-the next multiple. Python's own reader knows links, devices, sparse files and extended headers of
-any size; all of these have no place in a bundle, so here whatever is not a plain file with a sum
-that fits ends it.
+the next multiple. Python's own reader of whole archives knows links, devices, sparse files and
+extended headers of any size; all of these have no place in a bundle, so here it reads one header at
+a time, and whatever is not a plain file with a sum that fits ends it.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import hashlib
 import os
 import py_compile
 import shutil
+import tarfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -77,30 +78,15 @@ def _header(block: bytes) -> tuple[str, int]:
     """Name and size."""
     if block[257:265] != b"ustar\00000":
         raise DeployError("the bundle is not a plain tar (ustar)")
-    total = sum(block[:148]) + 8 * ord(" ") + sum(block[156:])
-    if _octal(block[148:156]) != total:
-        raise DeployError("the bundle is damaged: a header's sum is wrong")
-    name, prefix = _text(block[:100]), _text(block[345:500])
-    path = f"{prefix}/{name}" if prefix else name
-    if block[156:157] != b"0":
-        raise DeployError(f"the bundle's {path[:80]!r} is no plain file")
-    if mode := _octal(block[100:108]) & ~0o777:
-        raise DeployError(f"the bundle's {path[:80]!r} has the mode bits {mode:o}")
-    return path, _octal(block[124:136])
-
-
-def _octal(field: bytes) -> int:
-    digits = field.rstrip(b" \0")
-    if not digits or not digits.isdigit() or b"8" in digits or b"9" in digits:
-        raise DeployError("the bundle is damaged: a header's number is none")
-    return int(digits, 8)
-
-
-def _text(field: bytes) -> str:
     try:
-        return field.split(b"\0", 1)[0].decode()
-    except UnicodeDecodeError:
-        raise DeployError("the bundle has a name that is not UTF-8") from None
+        found = tarfile.TarInfo.frombuf(block, "utf-8", "strict")
+    except (tarfile.HeaderError, ValueError) as error:
+        raise DeployError(f"the bundle is damaged: a header: {error}") from None
+    if found.type != tarfile.REGTYPE or found.size < 0:
+        raise DeployError(f"the bundle's {found.name[:80]!r} is no plain file")
+    if mode := found.mode & ~0o777:
+        raise DeployError(f"the bundle's {found.name[:80]!r} has the mode bits {mode:o}")
+    return found.name, found.size
 
 
 def _exactly(stream: BinaryIO, size: int) -> bytes:
