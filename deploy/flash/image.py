@@ -18,16 +18,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
-from xml.parsers import expat
+from xml.etree import ElementTree
 
 from deploy.errors import DeployError
 from deploy.flash.boot import BootPartition
 from deploy.progress import Progress
 
 CHUNK_BYTES = 4 << 20
-_MAX_FILE_BYTES = 64 << 20
+_MAX_FILE_BYTES = 8 << 20
 _MAX_BLOCK_BYTES = 1 << 20
-_TEXT_OF = {"ImageSize", "BlockSize", "BlocksCount", "ChecksumType", "BmapFileChecksum", "Range"}
+_VALUES = ("ImageSize", "BlockSize", "ChecksumType", "BmapFileChecksum")
+_NUMBER = re.compile(r"\d{1,18}", re.ASCII)
 _RANGE = re.compile(r"(\d{1,18})(?:-(\d{1,18}))?", re.ASCII)
 _SHA256 = re.compile(r"[0-9a-f]{64}", re.ASCII)
 
@@ -51,8 +52,8 @@ def read_map(path: Path, image_bytes: int) -> list[Stretch]:
     except OSError as error:
         raise DeployError(f"{path}: {error.strerror or error}") from None
     try:
-        return _mapped(_Reader(data), data, image_bytes)
-    except (expat.ExpatError, ValueError) as error:
+        return _mapped(data, image_bytes)
+    except (ElementTree.ParseError, ValueError) as error:
         raise DeployError(f"{path}: not a block map: {' '.join(str(error).split())}") from None
 
 
@@ -96,65 +97,39 @@ def chunks(
         position += len(data)
 
 
-class _Reader:
-    """Collects the few elements of a map; a document type, where entities are made, is refused."""
+class _NoDoctype(ElementTree.TreeBuilder):
+    """Refuses a document type, where entities are made."""
 
-    def __init__(self, data: bytes) -> None:
-        self.values: dict[str, str] = {}
-        self.ranges: list[tuple[str, str]] = []
-        self.version = ""
-        self._depth = 0
-        self._text: list[str] = []
-        self._sum = ""
-        parser = expat.ParserCreate()
-        parser.StartDoctypeDeclHandler = self._refuse
-        parser.StartElementHandler = self._start
-        parser.EndElementHandler = self._end
-        parser.CharacterDataHandler = self._text.append
-        parser.Parse(data, True)
-
-    def _refuse(self, *_: object) -> None:
+    def doctype(self, *_: object) -> None:
         raise ValueError("it declares a document type")
 
-    def _start(self, name: str, attributes: dict[str, str]) -> None:
-        self._depth += 1
-        if self._depth > 3 or (self._depth == 1 and name != "bmap"):
-            raise ValueError(f"<{name[:30]}> is not expected there")
-        if self._depth == 1:
-            self.version = attributes.get("version", "")
-        self._text.clear()
-        self._sum = attributes.get("chksum", "").lower()
 
-    def _end(self, name: str) -> None:
-        self._depth -= 1
-        text = "".join(self._text).strip()
-        self._text.clear()
-        if name == "Range":
-            self.ranges.append((text, self._sum))
-        elif name in _TEXT_OF:
-            if name in self.values:
-                raise ValueError(f"<{name}> stands there twice")
-            self.values[name] = text
-
-
-def _mapped(read: _Reader, data: bytes, image_bytes: int) -> list[Stretch]:
-    if not read.version.startswith("2."):
-        raise ValueError(f"version {read.version[:20]!r}; expected 2.0")
-    if read.values.get("ChecksumType") != "sha256":
+def _mapped(data: bytes, image_bytes: int) -> list[Stretch]:
+    root = ElementTree.fromstring(data, ElementTree.XMLParser(target=_NoDoctype()))
+    if root.tag != "bmap":
+        raise ValueError(f"<{root.tag[:30]}> is not expected there")
+    values = {name: root.findtext(name, "").strip() for name in _VALUES}
+    if (version := root.get("version", "")[:20])[:2] != "2.":
+        raise ValueError(f"version {version!r}; expected 2.0")
+    if values["ChecksumType"] != "sha256":
         raise ValueError("its checksums are not sha256")
-    own = read.values.get("BmapFileChecksum", "")
+    own = values["BmapFileChecksum"]
     # The map's own checksum is made over the file with zeros in the checksum's place.
     blank = data.replace(own.encode(), b"0" * len(own), 1)
     if not _SHA256.fullmatch(own) or hashlib.sha256(blank).hexdigest() != own:
         raise ValueError("its own checksum is wrong: it is cut or damaged")
-    size, block = _number(read, "ImageSize"), _number(read, "BlockSize")
+    for name in ("ImageSize", "BlockSize"):
+        if not _NUMBER.fullmatch(values[name]):
+            raise ValueError(f"<{name}> is {values[name][:30]!r}")
+    size, block = int(values["ImageSize"]), int(values["BlockSize"])
     if size != image_bytes:
         raise ValueError(f"it is of an image of {size} bytes, and this one has {image_bytes}")
     if not 512 <= block <= _MAX_BLOCK_BYTES or block % 512:
         raise ValueError(f"BlockSize is {block}; allowed: multiples of 512 to {_MAX_BLOCK_BYTES}")
     stretches: list[Stretch] = []
     end = 0
-    for text, checksum in read.ranges:
+    for element in root.iterfind("BlockMap/Range"):
+        text, checksum = (element.text or "").strip(), element.get("chksum", "").lower()
         match = _RANGE.fullmatch(text)
         if match is None or not _SHA256.fullmatch(checksum):
             raise ValueError(f"range {text[:40]!r} with checksum {checksum[:70]!r}")
@@ -166,13 +141,6 @@ def _mapped(read: _Reader, data: bytes, image_bytes: int) -> list[Stretch]:
     if not stretches:
         raise ValueError("it names no block")
     return stretches
-
-
-def _number(read: _Reader, name: str) -> int:
-    text = read.values.get(name, "")
-    if not re.fullmatch(r"\d{1,18}", text, re.ASCII):
-        raise ValueError(f"<{name}> is {text[:30]!r}")
-    return int(text)
 
 
 MANIFEST_SCHEMA = "blimp.image/1"

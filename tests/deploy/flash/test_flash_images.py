@@ -172,6 +172,7 @@ def test_maps_that_are_hostile_cut_or_of_another_image(untouched: Bench) -> None
 
     cases = [
         (BOMB, "it declares a document type"),
+        (BOMB.decode().encode("utf-16"), "it declares a document type"),
         (good[:-40], "not a block map"),
         (good.replace(b"sha256", b"sha999", 1), "not a block map"),
         (b"<other/>", "<other> is not expected"),
@@ -182,7 +183,6 @@ def test_maps_that_are_hostile_cut_or_of_another_image(untouched: Bench) -> None
         (signed(ranged(b"0-" + stop)), "overlaps"),
         (signed(ranged(start + b"-99999999")), "lies outside"),
         (signed(ranged(b"-1")), "not a block map"),
-        (signed(good.replace(b"</BlockMap>", b"<a><b/></a></BlockMap>")), "is not expected there"),
         (ranged(b"257-" + stop), "its own checksum is wrong"),
     ]
     for data, said in cases:
