@@ -5,6 +5,7 @@ No text takes a small board's memory or hours.
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from collections.abc import Mapping
@@ -28,9 +29,8 @@ TOO_DEEP = re.compile(
     rf"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){{{DEEPEST}}}"""
 )
 _BOM = b"\xef\xbb\xbf"
-_SHORT = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\r": "\\r", "\t": "\\t"}
-# What some editors take for the end of a line, or leave out when they save.
-_ESCAPED = {0x7F, *range(0x80, 0xA0), 0x2028, 0x2029, 0xFEFF}
+# What TOML forbids, and what some editors take for the end of a line, or leave out when they save.
+_ESCAPED = re.compile("[\x7f-\x9f\u2028\u2029\ufeff]")
 
 
 def read(data: bytes) -> dict[str, Any]:
@@ -49,17 +49,8 @@ def read(data: bytes) -> dict[str, Any]:
 
 
 def string(text: str) -> str:
-    """A TOML basic string on one line."""
-    characters = []
-    for character in text:
-        code = ord(character)
-        if character in _SHORT:
-            characters.append(_SHORT[character])
-        elif code < 0x20 or code in _ESCAPED:
-            characters.append(f"\\u{code:04X}")
-        else:
-            characters.append(character)
-    return f'"{"".join(characters)}"'
+    """A TOML basic string on one line: JSON's, and a few more escapes."""
+    return _ESCAPED.sub(lambda m: f"\\u{ord(m[0]):04X}", json.dumps(text, ensure_ascii=False))
 
 
 FILE = "blimp.toml"
