@@ -65,8 +65,6 @@ def load_of(build: Build, mode: str) -> tuple[float, float]:
     3.3 V part hangs on the Pi's regulator, so its current counts at the converter's voltage, too.
     The converter's own idle current is the cell's.
     """
-    if mode not in MODES:
-        raise HardwareError(f"mode is {mode!r}; allowed: {', '.join(MODES)}")
     boost = _boost(build)
     behind = beside = 0.0
     for part in build.payload:
@@ -113,18 +111,15 @@ def drain(
     alive &= volts > max(wear.cutoff_V, part.cutoff_V)
     count = len(charge) if alive.all() else int(np.argmin(alive))
     rating = min(part.max_discharge_A, boost.max_input_A or part.max_discharge_A)
-    if count == 0:
-        return Endurance(mode, behind_W, 0.0, float(amperes[0]), float(amperes[0]),
-                         float(volts[0]), rating, float(amperes[0]) / part.capacity_mAh * 1000,
-                         "none")  # fmt: skip
-    mean = (amperes[: count - 1] + amperes[1:count]) / 2
+    last = max(count - 1, 0)
+    mean = (amperes[:last] + amperes[1 : last + 1]) / 2
     step_ah = capacity_ah * (1 - reserve) / _STEPS
-    minutes = 60 * float(np.sum(step_ah / mean)) if count > 1 else 0.0
-    end = float(amperes[count - 1])
+    minutes = 60 * float(np.sum(step_ah / mean))
+    end = float(amperes[last])
     verdict = "refuse" if end > rating else "warn" if end > 0.8 * rating else "ok"
     return Endurance(
-        mode, behind_W, minutes, float(amperes[0]), end, float(volts[count - 1]), rating,
-        end / part.capacity_mAh * 1000, verdict,
+        mode, behind_W, minutes, float(amperes[0]), end, float(volts[last]), rating,
+        end / part.capacity_mAh * 1000, verdict if count else "none",
     )  # fmt: skip
 
 

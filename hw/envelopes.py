@@ -91,6 +91,5 @@ def of_shape(shape: str, length_m: float, width_m: float, diameter_m: float) -> 
 
 def of_volume(shape: str, volume_m3: float) -> Envelope:
     """The envelope of a shape that holds a volume; an ellipsoid's length is two widths."""
-    checked("volume_m3", volume_m3)
     one = ellipsoid(2.0, 1.0) if shape == "ellipsoid" else of_shape(shape, 1.0, 1.0, 1.0)
     return one.scaled(float((volume_m3 / one.volume_m3) ** (1 / 3)))

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 from hw.builds import Build, shipped_builds
 from hw.buoyancy import margin_g
-from hw.quantities import HardwareError, checked
+from hw.quantities import HardwareError
 
 GRAVITY_M_S2 = 9.80665
 
@@ -49,15 +49,11 @@ def climb_s(
     area_m2: float,
     air_kg_m3: float,
 ) -> float:
-    """Seconds from rest to `height_m` with a surplus of lift; raises `HardwareError` without one.
+    """Seconds from rest to `height_m` with a surplus of lift, `free_lift_g` above 0.
 
     Buoyancy against drag, m v' = F − ½ρCA v², solved: h = m/k ln cosh(t √(Fk)/m). `moving_kg`
     holds the helium and the air that is carried along (added mass), too.
     """
-    checked("height_m", height_m)
-    checked("drag_coefficient", drag_coefficient)
-    if not free_lift_g > 0:
-        raise HardwareError(f"free_lift_g is {free_lift_g:g}; allowed: above 0")
     force = free_lift_g / 1000 * GRAVITY_M_S2
     k = 0.5 * air_kg_m3 * drag_coefficient * area_m2
     scale = moving_kg / math.sqrt(force * k)

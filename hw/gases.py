@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from hw.quantities import HardwareError, checked
+from hw.quantities import HardwareError
 
 STANDARD_PRESSURE_HPA = 1013.25
 _KELVIN = 273.15
@@ -16,7 +16,6 @@ def pressure_at_altitude(altitude_m: float) -> float:
     The troposphere of the International Standard Atmosphere (ISO 2533, 1975): 288.15 K and
     1013.25 hPa at 0 m, 6.5 K less each km.
     """
-    checked("altitude_m", altitude_m)
     exponent = 9.80665 / (287.05287 * 0.0065)
     return float(STANDARD_PRESSURE_HPA * (1 - 0.0065 * altitude_m / 288.15) ** exponent)
 
@@ -25,11 +24,8 @@ def air_kg_m3(temperature_C: float, pressure_hPa: float, humidity_percent: float
     """Density of moist air, kg/m³; humidity is relative.
 
     CoolProp's HAPropsSI, after Herrmann, Kretzschmar and Gatley, 'Thermodynamic properties of real
-    moist air', ASHRAE RP-1485, 2009. Raises `HardwareError` for an input outside its range.
+    moist air', ASHRAE RP-1485, 2009. Raises `HardwareError` for a state that cannot be.
     """
-    checked("temperature_C", temperature_C)
-    checked("pressure_hPa", pressure_hPa)
-    checked("humidity_percent", humidity_percent)
     from CoolProp.CoolProp import HAPropsSI
 
     volume = HAPropsSI(
@@ -53,13 +49,8 @@ def helium_kg_m3(
 
     Purity is helium's share of the volume, as on a cylinder; the rest is taken for dry air. Pure
     helium by CoolProp (Ortiz-Vega and others, J. Phys. Chem. Ref. Data 49, 2020); volumes of the
-    two add (Amagat's law). Superpressure, above the air outside, compresses both. Raises
-    `HardwareError`.
+    two add (Amagat's law). Superpressure, above the air outside, compresses both.
     """
-    checked("temperature_C", temperature_C)
-    checked("pressure_hPa", pressure_hPa)
-    checked("purity_percent", purity_percent)
-    checked("superpressure_Pa", superpressure_Pa)
     from CoolProp.CoolProp import PropsSI
 
     state = ("T", temperature_C + _KELVIN, "P", 100 * pressure_hPa + superpressure_Pa)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hw.quantities import HardwareError, checked
+from hw.quantities import HardwareError
 from pi_firmware.wire import config
 
 PARTS_FILE = Path(__file__).with_name("parts.toml")
@@ -53,7 +53,6 @@ class Part:
     max_thrust_N: float = config.key(0.0, "propulsion's", unit="N", low=0.0, high=1e3)
 
     def __post_init__(self) -> None:
-        checked("mass_g", self.mass_g)
         if not self.citation.strip():
             raise ValueError("it has no citation; allowed: the page or reasoning of its mass")
         if max(self.idle_mA, self.stream_mA, self.peak_mA) > 0:

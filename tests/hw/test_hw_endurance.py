@@ -105,7 +105,6 @@ def test_converters_efficiency_is_read_between_its_rows_and_held_beyond() -> Non
     [
         (lambda: Wear(health_percent=0.8), "health_percent is 0.8; allowed: 10 to 100 %"),
         (lambda: Wear(cutoff_V=5), "cutoff_V is 5; allowed: 2.5 to 4 V"),
-        (lambda: load_of(default(), "hover"), "mode is 'hover'; allowed: idle, stream, peak"),
         (lambda: fly(replace(default(), placed=())), "has no cell"),
     ],
 )
