@@ -100,12 +100,7 @@ def _described(image: Path) -> dict[str, Any]:
     path = beside(image, ".manifest.json")
     try:
         described: dict[str, Any] = json.loads(path.read_text())
-        _ = (
-            described["board"],
-            described["version"],
-            described["made"],
-            described["image"]["sha256"],
-        )
+        _ = [described[key] for key in ("board", "version", "made")], described["image"]["sha256"]
     except FileNotFoundError:
         raise DeployError(f"{path}: not there; make image makes it, beside the image") from None
     except (ValueError, KeyError, TypeError):

@@ -230,17 +230,16 @@ def _checksums(path: Path) -> dict[str, str]:
     """
     found = {}
     for subject in dict.fromkeys((path, _content_name(path))):
-        for place in (subject.with_name(subject.name + ".sha256"), subject.with_suffix(".sha256")):
-            try:
-                lines = place.read_text(errors="replace").splitlines()
-            except FileNotFoundError:
-                continue
-            matches = [match for line in lines if (match := _SUM.fullmatch(line.strip()))]
-            for match in matches:
-                if match[2] is None or Path(match[2]).name == subject.name:
-                    found[subject.name] = match[1].lower()
-            if subject.name not in found and place.name == subject.name + ".sha256":
-                raise DeployError(f"{place}: it tells no checksum of {subject.name}")
+        place = _beside(subject, ".sha256")
+        try:
+            lines = place.read_text(errors="replace").splitlines()
+        except FileNotFoundError:
+            continue
+        for match in filter(None, (_SUM.fullmatch(line.strip()) for line in lines)):
+            if match[2] is None or Path(match[2]).name == subject.name:
+                found[subject.name] = match[1].lower()
+        if subject.name not in found:
+            raise DeployError(f"{place}: it tells no checksum of {subject.name}")
     return found
 
 
@@ -280,22 +279,21 @@ def _unpack(path: Path, source: BinaryIO, content: BinaryIO, progress: Progress)
 
 def _stretches(path: Path, file: BinaryIO, size: int) -> list[Stretch]:
     """What must be written: what the map beside the image says, or all of it."""
-    stem = _content_name(path)
-    for place in (stem.with_name(stem.name + ".bmap"), stem.with_suffix(".bmap")):
-        if place.is_file():
-            stretches = read_map(place, size)
-            wrong = verify(file, stretches)
-            if wrong is not None:
-                raise DeployError(
-                    f"{place}: not the map of this image (byte {wrong}); delete it, or build again"
-                )
-            return stretches
-    return [Stretch(0, size)]
+    place = _beside(_content_name(path), ".bmap")
+    if not place.is_file():
+        return [Stretch(0, size)]
+    stretches = read_map(place, size)
+    wrong = verify(file, stretches)
+    if wrong is not None:
+        raise DeployError(
+            f"{place}: not the map of this image (byte {wrong}); delete it, or build again"
+        )
+    return stretches
 
 
 def _manifest(path: Path) -> dict[str, Any]:
     """The builder's description beside an image; empty where there is none."""
-    place = _content_name(path).with_name(_content_name(path).name + ".manifest.json")
+    place = _beside(_content_name(path), ".manifest.json")
     try:
         document = json.loads(place.read_bytes())
     except FileNotFoundError:
@@ -305,6 +303,10 @@ def _manifest(path: Path) -> dict[str, Any]:
     if not isinstance(document, dict) or document.get("schema") != MANIFEST_SCHEMA:
         raise DeployError(f"{place}: not of schema {MANIFEST_SCHEMA}")
     return document
+
+
+def _beside(image: Path, suffix: str) -> Path:
+    return image.with_name(image.name + suffix)
 
 
 def _content_name(path: Path) -> Path:

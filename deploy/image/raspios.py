@@ -67,9 +67,7 @@ def build(
         run(["e2fsck", "-fp", root_place], ok=(0, 1), env=ext4.clock(epoch))
         before = ext4.read_tree(root_place, _is_wanted, contents)
         missing = _check(base, before, board)
-        tree = Tree()
-        for path, entry in before.items():
-            tree.put(path, entry)
+        tree = before.copy()
         digest_of_base = sha256(base)
         if missing:
             log(f"{len(missing)} packages that the base lacks (emulated, the first time)")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import tarfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -72,8 +72,8 @@ class Entry:
 class Tree:
     """Entries by their path, relative to the root and without a leading slash."""
 
-    def __init__(self) -> None:
-        self._entries: dict[str, Entry] = {}
+    def __init__(self, entries: Mapping[str, Entry] | None = None) -> None:
+        self._entries = dict(entries or {})
 
     @staticmethod
     def from_tar(path: Path) -> Tree:
@@ -239,13 +239,14 @@ class Tree:
         place = self.resolve(folder) + "/"
         return ((path, entry) for path, entry in self.items() if path.startswith(place))
 
+    def copy(self) -> Tree:
+        """A tree of the very same entries."""
+        return Tree(self._entries)
+
     def changed(self, before: Tree) -> Tree:
         """The entries that are not the very ones of another tree."""
-        result = Tree()
-        for path, entry in self.items():
-            if before._entries.get(path) is not entry:
-                result.put(path, entry)
-        return result
+        mine = self._entries.items()
+        return Tree({path: one for path, one in mine if before._entries.get(path) is not one})
 
     def digest(self, epoch: int) -> bytes:
         """SHA-256 over every path, owner, mode, time and content."""

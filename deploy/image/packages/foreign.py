@@ -40,7 +40,6 @@ _PR_SET_PDEATHSIG = 1
 ARCHITECTURES = {
     "arm64": (("aarch64",), "aarch64", _ELF_CLASS_64, 183),
     "armhf": (("armv7l", "armv8l", "aarch64"), "arm", _ELF_CLASS_32, 40),
-    "armel": (("armv7l", "armv8l", "aarch64"), "arm", _ELF_CLASS_32, 40),
 }
 
 

@@ -7,7 +7,6 @@ import os
 import re
 import sys
 import zipfile
-from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from deploy.errors import DeployError
@@ -34,8 +33,6 @@ _LOCK = Path(__file__).parents[3] / "requirements.lock"
 _START = re.compile(r"^([A-Za-z0-9][A-Za-z0-9._-]*)==([^ ;\\]+)")
 _NETWORK_TRIES, _NETWORK_LIMIT_S = "3", "60"
 
-# A wheel is unpacked to at most this; the biggest taken, eclipse-zenoh, has 33 MB.
-_LIMIT_BYTES = 256 << 20
 _FILE_MODE, _LIBRARY_MODE = 0o644, 0o755
 _COMPILED = (".so", ".pyd", ".dylib")
 
@@ -96,44 +93,32 @@ def requirement(lock: Path, name: str) -> str:
 def unpack(wheel_file: Path, site: Path, wheel: Wheel) -> None:
     """Unpacks what `wheel` keeps of a wheel (a zip, PEP 427) into `site`.
 
+    Its hash stands in the lock, so that it is not looked at for harm; zipfile keeps it in `site`.
+
     Raises:
-        DeployError: no wheel, a path that leaves `site`, a file that is there already, more than
-            256 MiB, or compiled code where only portable Python is wanted.
+        DeployError: no wheel, one that wants an installer, a file that is there already, or
+            compiled code where only portable Python is wanted.
     """
     try:
         with zipfile.ZipFile(wheel_file) as archive:
             members = [member for member in archive.infolist() if not member.is_dir()]
-            if sum(member.file_size for member in members) > _LIMIT_BYTES:
-                raise DeployError(f"{wheel_file.name}: unpacks to more than {_LIMIT_BYTES} bytes")
             for member in sorted(members, key=lambda member: member.filename):
-                if wheel.keep and not _kept(member.filename, wheel.keep):
+                path = PurePosixPath(member.filename)
+                if wheel.keep and not any(fnmatch.fnmatchcase(str(path), p) for p in wheel.keep):
                     continue
-                path = _safe(member.filename, wheel_file)
+                # `NAME.data/purelib` is an installer's to move; no wheel taken has one.
+                if path.parts[0].endswith(".data"):
+                    raise DeployError(f"{wheel_file.name}: {path} wants an installer")
                 if wheel.portable and path.suffix in _COMPILED:
                     raise DeployError(f"{wheel_file.name}: {path} is compiled, for who knows whom")
-                target = site / path
-                if target.exists():
+                if (site / path).exists():
                     raise DeployError(f"{wheel_file.name}: {path} is there from another wheel")
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_bytes(archive.read(member))
-                target.chmod(_LIBRARY_MODE if path.suffix == ".so" else _FILE_MODE)
+                Path(archive.extract(member, site)).chmod(
+                    _LIBRARY_MODE if path.suffix == ".so" else _FILE_MODE
+                )
     # zipfile says NotImplementedError of a compression that it does not know.
     except (zipfile.BadZipFile, EOFError, NotImplementedError) as error:
         raise DeployError(f"{wheel_file.name}: no wheel, or cut: {error}") from None
-
-
-def _kept(name: str, patterns: Sequence[str]) -> bool:
-    return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
-
-
-def _safe(name: str, wheel_file: Path) -> PurePosixPath:
-    path = PurePosixPath(name)
-    if path.is_absolute() or ".." in path.parts or "\\" in name or not path.parts:
-        raise DeployError(f"{wheel_file.name}: the path {name!r} leaves its folder")
-    # `NAME.data/purelib` and the like are moved by an installer; no wheel taken has one.
-    if path.parts[0].endswith(".data"):
-        raise DeployError(f"{wheel_file.name}: {name} wants an installer")
-    return path
 
 
 def _download(board: Board, wheel: Wheel, pinned: str, work: Path) -> Path:

@@ -118,19 +118,19 @@ def test_a_lock_without_the_wheel_or_its_hash_is_refused(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("path", "complaint"),
     [
-        ("../evil.py", "leaves its folder"),
-        ("/etc/evil.py", "leaves its folder"),
-        ("thing/..\\evil.py", "leaves its folder"),
         ("thing-1.0.data/scripts/evil", "wants an installer"),
         ("here.py", "is there from another wheel"),
     ],
 )
-def test_a_wheel_stays_in_its_folder(tmp_path: Path, path: str, complaint: str) -> None:
+def test_a_wheel_that_is_not_just_unpacked_is_refused(
+    tmp_path: Path, path: str, complaint: str
+) -> None:
     site = tmp_path / "site"
     site.mkdir()
     (site / "here.py").touch()
     with pytest.raises(DeployError, match=complaint):
         unpack(_wheel(tmp_path / "w", {path: b"x"}), site, Wheel("thing"))
+    unpack(_wheel(tmp_path / "w", {"../out.py": b"x"}), site, Wheel("thing"))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["site", "w"]
     assert (site / "here.py").read_bytes() == b""
 
