@@ -10,36 +10,6 @@ from pathlib import Path
 
 from deploy.errors import DeployError
 
-# The Debian package of each tool that deploy/ runs and that a plain system may lack.
-_PACKAGES = {
-    "apt-get": "apt",
-    "bmaptool": "bmap-tools",
-    "debugfs": "e2fsprogs",
-    "depmod": "kmod",
-    "dpkg-deb": "dpkg",
-    "dumpe2fs": "e2fsprogs",
-    "e2fsck": "e2fsprogs",
-    "fsck.vfat": "dosfstools",
-    "git": "git",
-    "mcopy": "mtools",
-    "mdel": "mtools",
-    "mdir": "mtools",
-    "mke2fs": "e2fsprogs",
-    "mkfs.vfat": "dosfstools",
-    "mmd": "mtools",
-    "mmdebstrap": "mmdebstrap",
-    "mtype": "mtools",
-    "qemu-aarch64-static": "qemu-user-static",
-    "qemu-arm-static": "qemu-user-static",
-    "resize2fs": "e2fsprogs",
-    "sfdisk": "fdisk",
-    "ssh": "openssh-client",
-    "ssh-keygen": "openssh-client",
-    "tune2fs": "e2fsprogs",
-    "xz": "xz-utils",
-    "zstd": "zstd",
-}
-
 # Debian keeps some tools where a plain user's PATH does not look.
 _SYSTEM_FOLDERS = ("/usr/local/sbin", "/usr/sbin", "/sbin")
 
@@ -51,12 +21,12 @@ def find(tool: str) -> str | None:
 
 
 def need(tool: str) -> str:
-    """The tool's path; raises `DeployError` that names the Debian package when it is missing."""
+    """The tool's path; raises `DeployError` that says what installs it when it is missing."""
     path = find(tool)
     if path is None:
-        package = _PACKAGES.get(Path(tool).name)
-        hint = f": sudo apt-get install {package}" if package else ""
-        raise DeployError(f"{tool}: not found{hint}")
+        raise DeployError(
+            f"{tool}: not found; make setup installs it, make image what an image needs"
+        )
     return path
 
 

@@ -34,27 +34,16 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLE,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--payload", required=True, metavar="NAME", help="the payload's id")
-    parser.add_argument("--host", help="its address (default: its id as a name in the network)")
-    parser.add_argument("--port", type=int, default=22, help="of its sshd (default: 22)")
-    parser.add_argument(
-        "--keys", type=Path, metavar="DIR", help="the folder of `blimp keys` (default: its own)"
-    )
-    parser.add_argument(
-        "--identity",
-        type=Path,
-        metavar="FILE",
-        help="the pilot's SSH key (default: the ground station's)",
-    )
-    parser.add_argument(
-        "--site", type=Path, metavar="DIR", help="unpacked wheels (default: those of the lock)"
-    )
-    parser.add_argument(
-        "--allow-older", action="store_true", help="may replace the newer version that runs now"
-    )
-    parser.add_argument(
-        "--force", action="store_true", help="also while its autopilot is armed: video stops"
-    )
+    add = parser.add_argument
+    add("--payload", required=True, metavar="NAME", help="the payload's id")
+    add("--host", help="its address (default: its id as a name in the network)")
+    add("--port", type=int, default=22, help="of its sshd (default: 22)")
+    add("--keys", type=Path, metavar="DIR", help="the folder of `blimp keys` (default: its own)")
+    add("--identity", type=Path, metavar="FILE",
+        help="the pilot's SSH key (default: the ground station's)")  # fmt: skip
+    add("--site", type=Path, metavar="DIR", help="unpacked wheels (default: those of the lock)")
+    add("--allow-older", action="store_true", help="may replace the newer version that runs now")
+    add("--force", action="store_true", help="also while its autopilot is armed: video stops")
     return parser
 
 
