@@ -15,8 +15,6 @@ import hashlib
 import json
 import os
 import re
-import shutil
-import tempfile
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -26,6 +24,7 @@ from typing import Any
 from deploy.errors import DeployError
 from deploy.image import ext4, fat, initrd, partitions, release, root
 from deploy.image.packages.board import Board
+from deploy.image.packages.cache import workshop
 from deploy.image.packages.kernel import Kernel
 from deploy.image.partitions import FAT32_LBA, LINUX, Partition, align, power_of_two, table
 from deploy.image.release import folder_files, utc
@@ -226,26 +225,20 @@ def building(image: Path) -> Iterator[Path]:
         folder = os.open(image.parent, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
         raise DeployError(f"{image}: {error.strerror or error}") from None
-    prefix = f".{image.name}.part-"
-    work = None
     try:
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise DeployError(f"{image.parent}: another image is being built there") from None
-        for left in image.parent.glob(f"{prefix}*"):
-            shutil.rmtree(left, ignore_errors=True)
-        work = Path(tempfile.mkdtemp(prefix=prefix, dir=image.parent))
-        yield work
-        # The old image goes before its description does: no image beside another's.
-        image.unlink(missing_ok=True)
-        for suffix in (*DESCRIPTIONS, ""):
-            beside(work / image.name, suffix).replace(beside(image, suffix))
+        with workshop(image) as work:
+            yield work
+            # The old image goes before its description does: no image beside another's.
+            image.unlink(missing_ok=True)
+            for suffix in (*DESCRIPTIONS, ""):
+                beside(work / image.name, suffix).replace(beside(image, suffix))
     except OSError as error:
         raise DeployError(f"{error.filename or image}: {error.strerror or error}") from None
     finally:
-        if work is not None:
-            shutil.rmtree(work, ignore_errors=True)
         os.close(folder)
 
 

@@ -8,7 +8,6 @@ since the pins go by the name it calls itself.
 from __future__ import annotations
 
 import re
-import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -171,10 +170,7 @@ def _same(url: str) -> str:
 @contextmanager
 def opened(board: Board) -> Iterator[Apt]:
     """A private apt with fresh, verified indexes, gone afterwards."""
-    root = Path(tempfile.mkdtemp(prefix="blimp-apt-"))
-    try:
-        apt = Apt(root, board)
+    with tempfile.TemporaryDirectory(prefix="blimp-apt-", ignore_cleanup_errors=True) as root:
+        apt = Apt(Path(root), board)
         apt.update()
         yield apt
-    finally:
-        shutil.rmtree(root, ignore_errors=True)

@@ -51,25 +51,30 @@ def made(target: Path) -> Iterator[Path | None]:
         if target.exists():
             yield None
             return
-        _clear(target)
-        work = Path(tempfile.mkdtemp(prefix=f".{target.name}.part-", dir=target.parent))
-        try:
+        with workshop(target) as work:
             yield work
             os.sync()  # all that was made, of which there may be thousands of files
             (work / target.name).rename(target)
             sync_folder(target.parent)
-        finally:
-            shutil.rmtree(work, ignore_errors=True)
     except OSError as error:
         raise DeployError(f"{error.filename or target}: {error.strerror or error}") from None
     finally:
         os.close(lock)
 
 
-def _clear(target: Path) -> None:
-    """What a killed process left of this target; its lock is ours now."""
-    for left in target.parent.glob(f".{target.name}.part-*"):
+@contextlib.contextmanager
+def workshop(target: Path) -> Iterator[Path]:
+    """A folder beside a target, gone afterwards, and with it what a killed process left there.
+
+    One at a time: the caller holds a lock.
+    """
+    prefix = f".{target.name}.part-"
+    for left in target.parent.glob(f"{prefix}*"):
         shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(
+        prefix=prefix, dir=target.parent, ignore_cleanup_errors=True
+    ) as work:
+        yield Path(work)
 
 
 def _plain(item: Any) -> Any:

@@ -17,7 +17,6 @@ import signal
 import struct
 import subprocess
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -191,9 +190,8 @@ def run_long(
 ) -> None:
     """Runs a tool to its end, everything it says in `log`.
 
-    Its steps stand on standard error: one line that is written over on a terminal, else a line
-    each. Stopped by Ctrl-C or SIGTERM's exception, the tool and its children are told to clean up
-    and end, and after half a minute made to.
+    Its steps stand on standard error. Stopped by Ctrl-C or SIGTERM's exception, the tool and its
+    children are told to clean up and end, and after half a minute made to.
 
     Raises:
         DeployError: the tool is missing or fails; one line with what it said was wrong.
@@ -204,9 +202,6 @@ def run_long(
         # Were this program killed, nobody would end the tool and clear its folder.
         arguments = [dies_with_us, "--pdeathsig", "TERM", "--", *arguments]
     environment = {**os.environ, "LC_ALL": "C.UTF-8", **(env or {})}
-    start_s = time.monotonic()
-    terminal = sys.stderr.isatty()
-    step = ""
     with log.open("wb") as out, log.open("r", errors="replace") as said:
         process = subprocess.Popen(
             arguments,
@@ -220,19 +215,10 @@ def run_long(
             ended = False
             while not ended:
                 ended = _waited(process)
-                for line in said:
-                    found = _STEP.match(line)
-                    if found and found["what"] != step:
-                        step = found["what"]
-                        if not terminal:
-                            print(f"{label}: {step}", file=sys.stderr, flush=True)
-                if terminal:
-                    passed = f"{label}: {time.monotonic() - start_s:.0f} s: {step}"
-                    print(f"\r\x1b[K{passed[:78]}", end="", file=sys.stderr, flush=True)
+                for found in filter(None, map(_STEP.match, said)):
+                    print(f"{label}: {found['what']}", file=sys.stderr, flush=True)
         finally:
             _end(process)
-            if terminal:
-                print("\r\x1b[K", end="", file=sys.stderr, flush=True)
     if process.returncode != 0:
         raise DeployError(f"{label}: {_fault(log, process.returncode)}")
 
