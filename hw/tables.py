@@ -82,18 +82,16 @@ def mass_budget(build: Build, margin: Margin) -> Table:
         (item.name, item.source, f"{item.mass_g:.1f}", f"{item.spread_g:.1f}")
         for item in build.items
     ]
-    lift_sigma = sum(s * s for n, s in margin.parts_sigma_g.items() if n not in _names(build))
-    mass_sigma = sum(s * s for n, s in margin.parts_sigma_g.items() if n in _names(build))
+    weighed = {item.name for item in build.items}
+    sigmas_g = margin.parts_sigma_g.items()
+    mass_sigma = math.hypot(*(sigma for name, sigma in sigmas_g if name in weighed))
+    lift_sigma = math.hypot(*(sigma for name, sigma in sigmas_g if name not in weighed))
     rows += [
-        ("all that flies", "", f"{margin.mass_g:.1f}", f"{mass_sigma**0.5:.1f}"),
-        ("gross lift", "", f"{margin.gross_g:.1f}", f"{lift_sigma**0.5:.1f}"),
+        ("all that flies", "", f"{margin.mass_g:.1f}", f"{mass_sigma:.1f}"),
+        ("gross lift", "", f"{margin.gross_g:.1f}", f"{lift_sigma:.1f}"),
         ("margin", "", f"{margin.margin_g:+.1f}", f"{margin.sigma_g:.1f}"),
     ]
     return Table(("what", "mass is from", "g", "±"), tuple(rows), right=2)
-
-
-def _names(build: Build) -> set[str]:
-    return {item.name for item in build.items}
 
 
 def builds_table(catalogue: Catalogue) -> Table:

@@ -5,6 +5,7 @@ the firmware's defaults < the board's < blimp/payload.toml < what blimp.toml say
 
 from __future__ import annotations
 
+import copy
 import math
 import re
 from collections.abc import Mapping
@@ -55,10 +56,7 @@ def dump(document: Mapping[str, Any]) -> str:
 
 
 def _over(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    result = {
-        key: _over(value, {}) if isinstance(value, Mapping) else value
-        for key, value in below.items()
-    }
+    result = copy.deepcopy(dict(below))
     for key, value in above.items():
         mine = result.get(key)
         if isinstance(value, Mapping):

@@ -20,7 +20,7 @@ import mmap
 import os
 import stat
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from deploy.errors import DeployError, Interrupted
@@ -204,10 +204,8 @@ def _write(image: Image, target: Target, stretches: list[Stretch]) -> None:
     with Progress("writing", sum(part.stop - part.start for part in stretches)) as progress:
         for stretch in stretches:
             for start, data in chunks(image.file, stretch):
-                try:
+                with _failing(target, "write", start):
                     target.write(start, data)
-                except OSError as error:
-                    raise _failed(target, "write", start, error) from None
                 waiting += len(data)
                 if waiting >= _FLUSH_BYTES:
                     _flush(target, start)
@@ -226,10 +224,8 @@ def _compare(
     with shown as progress:
         for stretch in stretches:
             for start, data in chunks(image.file, stretch):
-                try:
+                with _failing(target, "read", start):
                     got = target.read(start, len(data))
-                except OSError as error:
-                    raise _failed(target, "read", start, error) from None
                 if got != data:
                     at = start + _first_difference(got, data)
                     raise DeployError(
@@ -246,12 +242,15 @@ def _first_difference(one: bytes, other: bytes) -> int:
 
 
 def _flush(target: Target, start: int) -> None:
-    try:
+    with _failing(target, "write", start):
         target.flush()
+
+
+@contextlib.contextmanager
+def _failing(target: Target, what: str, start: int) -> Iterator[None]:
+    """Tells of a card's error where it was."""
+    try:
+        yield
     except OSError as error:
-        raise _failed(target, "write", start, error) from None
-
-
-def _failed(target: Target, what: str, start: int, error: OSError) -> DeployError:
-    reason = error.strerror or error
-    return DeployError(f"{target.path}: {what} error at about byte {start}: {reason}")
+        reason = error.strerror or error
+        raise DeployError(f"{target.path}: {what} error at about byte {start}: {reason}") from None
