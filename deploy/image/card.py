@@ -157,7 +157,7 @@ def build(
         modules = f"usr/lib/modules/{kernel.version}"
         if not (kernel.root / modules / "modules.dep").is_file():
             raise DeployError(f"{kernel.root}/{modules}: no modules.dep in it")
-        tree.take(kernel.root, [f"{modules}/{n}" for n in _files(kernel.root / modules)])
+        tree.take(kernel.root, [f"{modules}/{n}" for n in folder_files(kernel.root / modules)])
         firmware = release.build(checkout, site, board.machine, board.python, epoch)
         units = root.customise(tree, checkout, board.name, firmware, epoch)
         if compile is not None:
@@ -167,7 +167,7 @@ def build(
         log(f"root: {len(tree)} files, {len(units)} units enabled")
         first = initrd.build(tree, kernel.version)
         files = Tree()
-        files.take(kernel.boot, _files(kernel.boot))
+        files.take(kernel.boot, folder_files(kernel.boot))
         if kernel.image not in files:
             raise DeployError(f"{kernel.boot}: no kernel '{kernel.image}' in it")
         where = f"UUID={new.uuid('root')}"
@@ -245,13 +245,6 @@ def building(image: Path) -> Iterator[Path]:
 def beside(image: Path, suffix: str) -> Path:
     """The file that describes an image: `.bmap`, `.manifest.json` or `.sha256` behind its name."""
     return image.with_name(image.name + suffix)
-
-
-def _files(folder: Path) -> list[str]:
-    found = release.folder_files(folder)
-    if not found:
-        raise DeployError(f"{folder}: no files in it")
-    return found
 
 
 SCHEMA = "blimp.image/1"

@@ -37,6 +37,7 @@ _PR_SET_PDEATHSIG = 1
 
 # Debian's architecture: (this machine's name for it, QEMU's name, ELF class, ELF machine).
 ARCHITECTURES = {
+    "amd64": (("x86_64",), "x86_64", _ELF_CLASS_64, 62),
     "arm64": (("aarch64",), "aarch64", _ELF_CLASS_64, 183),
     "armhf": (("armv7l", "armv8l", "aarch64"), "arm", _ELF_CLASS_32, 40),
 }
@@ -47,14 +48,12 @@ def prefix(architecture: str) -> list[str]:
 
     Empty where the system runs them as it is. Raises `DeployError` where it cannot be had.
     """
-    natives = ARCHITECTURES.get(architecture, ((), "", 0, 0))[0]
-    if platform.machine() in natives or architecture == _native():
-        return []
     if architecture not in ARCHITECTURES:
         raise DeployError(
             f"architecture {architecture}: emulated are {', '.join(sorted(ARCHITECTURES))}"
         )
-    if _handled(ARCHITECTURES[architecture][1]):
+    natives, qemu, *_ = ARCHITECTURES[architecture]
+    if platform.machine() in natives or _handled(qemu):
         return []
     need(interpreter(architecture))
     if os.geteuid() != 0:
@@ -68,11 +67,6 @@ def prefix(architecture: str) -> list[str]:
 def environment() -> dict[str, str]:
     """What `prefix`'s command needs in its environment, from whatever folder it is started."""
     return {"PYTHONPATH": str(Path(__file__).parents[3])}
-
-
-def _native() -> str:
-    machines = {"x86_64": "amd64", "aarch64": "arm64", "armv7l": "armhf"}
-    return machines.get(platform.machine(), platform.machine())
 
 
 def interpreter(architecture: str) -> str:
