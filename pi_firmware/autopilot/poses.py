@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -26,31 +25,19 @@ _UPRIGHT = np.diag([1.0, -1.0, -1.0])  # z up to z down, about the x axis
 _MIN_COSINE = 1e-2  # Euler angles have no covariance straight up or down
 
 
-@dataclass(frozen=True)
 class Mounting:
     """How the camera sits in the vehicle, and the map in the world.
 
-    `roll_deg`, `pitch_deg`, `yaw_deg` turn a camera that looks ahead, in the body's axes and in the
-    order yaw, pitch, roll: pitch -90 looks down. `position_m` is the camera's in the body's axes.
-    `heading_deg` is the compass heading of the map's x axis.
+    `bRc` (3, 3) are the camera's axes in the body's, `offset_m` (3,) is its place there, `nRw`
+    (3, 3) are the map's axes in north-east-down. The mount's angles turn a camera that looks ahead,
+    in the body's axes and in the order yaw, pitch, roll: pitch -90 looks down.
     """
 
-    roll_deg: float = 0.0
-    pitch_deg: float = 0.0
-    yaw_deg: float = 0.0
-    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    heading_deg: float = 0.0
-
-    @cached_property
-    def bRc(self) -> Array:
-        """The camera's axes in the body's, (3, 3)."""
-        angles = (math.radians(a) for a in (self.roll_deg, self.pitch_deg, self.yaw_deg))
-        return np.asarray(rotation(*angles) @ _AHEAD)
-
-    @cached_property
-    def nRw(self) -> Array:
-        """The map's axes in north-east-down, (3, 3)."""
-        return rotation(0.0, 0.0, math.radians(self.heading_deg)) @ _UPRIGHT
+    def __init__(self, settings: AutopilotSettings) -> None:
+        degrees = settings.mount_roll_deg, settings.mount_pitch_deg, settings.mount_yaw_deg
+        self.bRc = rotation(*map(math.radians, degrees)) @ _AHEAD
+        self.nRw = rotation(0.0, 0.0, math.radians(settings.world_heading_deg)) @ _UPRIGHT
+        self.offset_m = np.array(settings.mount_m)
 
 
 @dataclass(frozen=True)
@@ -98,10 +85,9 @@ def vehicle_pose(
     `ValueError` for a quaternion that is no rotation.
     """
     wRc = _matrix(quaternion_xyzw)
-    bRc, nRw = mounting.bRc, mounting.nRw
+    bRc, nRw, offset = mounting.bRc, mounting.nRw, mounting.offset_m
     nRc = nRw @ wRc
     nRb = nRc @ bRc.T
-    offset = np.array(mounting.position_m)
     angles = _angles(nRb)
     if covariance is not None:
         roll, pitch = angles[0], angles[1]
@@ -194,14 +180,7 @@ class PoseGate:
         self.counts = PoseCounts()
         self.reset_counter = 0
         self._settings = settings
-        x, y, z = settings.mount_m
-        self._mounting = Mounting(
-            roll_deg=settings.mount_roll_deg,
-            pitch_deg=settings.mount_pitch_deg,
-            yaw_deg=settings.mount_yaw_deg,
-            position_m=(x, y, z),
-            heading_deg=settings.world_heading_deg,
-        )
+        self._mounting = Mounting(settings)
         self._last: tuple[int, VehiclePose] | None = None
         self._interrupted = False
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,27 +21,31 @@ ALONG_Y = (-HALF, 0.0, 0.0, HALF)
 DOWN = (-HALF, HALF, 0.0, 0.0)
 
 
+def mounted(**settings: Any) -> Mounting:
+    return Mounting(AutopilotSettings(**settings))
+
+
 @pytest.mark.parametrize(
     ("quaternion", "mounting", "position", "degrees"),
     [
         # The map's x is north: y is west, z up. Ahead along x is north and level.
-        (ALONG_X, Mounting(), (1, -2, -3), (0, 0, 0)),
+        (ALONG_X, mounted(), (1, -2, -3), (0, 0, 0)),
         # Along y is west.
-        (ALONG_Y, Mounting(), (1, -2, -3), (0, 0, -90)),
+        (ALONG_Y, mounted(), (1, -2, -3), (0, 0, -90)),
         # The map's x is east: y is north.
-        (ALONG_X, Mounting(heading_deg=90), (2, 1, -3), (0, 0, 90)),
-        (ALONG_Y, Mounting(heading_deg=90), (2, 1, -3), (0, 0, 0)),
+        (ALONG_X, mounted(world_heading_deg=90), (2, 1, -3), (0, 0, 90)),
+        (ALONG_Y, mounted(world_heading_deg=90), (2, 1, -3), (0, 0, 0)),
         # A camera mounted looking down, in a level vehicle that heads north.
-        (DOWN, Mounting(pitch_deg=-90), (1, -2, -3), (0, 0, 0)),
+        (DOWN, mounted(mount_pitch_deg=-90), (1, -2, -3), (0, 0, 0)),
         # A camera mounted looking to the right sees north: the vehicle heads west.
-        (ALONG_X, Mounting(yaw_deg=90), (1, -2, -3), (0, 0, -90)),
+        (ALONG_X, mounted(mount_yaw_deg=90), (1, -2, -3), (0, 0, -90)),
         # Mounted tilted down by 30 degrees and level in the world: the nose is up by 30.
-        (ALONG_X, Mounting(pitch_deg=-30), (1, -2, -3), (0, 30, 0)),
+        (ALONG_X, mounted(mount_pitch_deg=-30), (1, -2, -3), (0, 30, 0)),
         # Mounted upside down and upright in the world: the vehicle is on its back.
-        (ALONG_X, Mounting(roll_deg=180), (1, -2, -3), (-180, 0, 0)),
+        (ALONG_X, mounted(mount_roll_deg=180), (1, -2, -3), (-180, 0, 0)),
         # The camera sits 0.5 m before, 0.1 right of and 0.2 below the centre; the vehicle heads
         # west, where forward is west, right is north and down is down.
-        (ALONG_Y, Mounting(position_m=(0.5, 0.1, 0.2)), (0.9, -1.5, -3.2), (0, 0, -90)),
+        (ALONG_Y, mounted(mount_m=[0.5, 0.1, 0.2]), (0.9, -1.5, -3.2), (0, 0, -90)),
     ],
 )
 def test_hand_worked_poses(
@@ -57,7 +62,7 @@ def test_hand_worked_poses(
 
 def test_velocity_is_the_vehicles_centres_in_its_own_axes() -> None:
     """The camera sits 0.5 m ahead of a centre that rests and yaws to the right: it moves right."""
-    mounting = Mounting(position_m=(0.5, 0.0, 0.0), heading_deg=90)
+    mounting = mounted(mount_m=[0.5, 0.0, 0.0], world_heading_deg=90)
     moves_right, yaws_right = (0.5 * 0.4, 0.0, 0.0), (0.0, 0.4, 0.0)  # it looks along the map's y
     pose = vehicle_pose((1.0, 2.0, 3.0), ALONG_Y, None, mounting, moves_right, yaws_right)
     assert pose.velocity_mps is not None and pose.turn_radps is not None
@@ -66,7 +71,7 @@ def test_velocity_is_the_vehicles_centres_in_its_own_axes() -> None:
     ahead = vehicle_pose((1.0, 2.0, 3.0), ALONG_Y, None, mounting, (0.0, 0.7, 0.1), (0, 0, 0))
     assert ahead.velocity_mps is not None
     np.testing.assert_allclose(ahead.velocity_mps, (0.7, 0, -0.1), atol=1e-12)
-    down = vehicle_pose((1.0, 2.0, 3.0), DOWN, None, Mounting(pitch_deg=-60))
+    down = vehicle_pose((1.0, 2.0, 3.0), DOWN, None, mounted(mount_pitch_deg=-60))
     w, x, y, z = down.quaternion_wxyz()
     np.testing.assert_allclose(
         [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)],
@@ -76,7 +81,7 @@ def test_velocity_is_the_vehicles_centres_in_its_own_axes() -> None:
 
 
 def test_an_unknown_covariance_is_nan_in_its_first_number() -> None:
-    pose = vehicle_pose((0, 0, 0), ALONG_X, None, Mounting())
+    pose = vehicle_pose((0, 0, 0), ALONG_X, None, mounted())
     triangle = pose.upper_triangle()
     assert len(triangle) == 21 and math.isnan(triangle[0])
 
@@ -84,7 +89,7 @@ def test_an_unknown_covariance_is_nan_in_its_first_number() -> None:
 def test_covariance_of_a_level_camera_is_turned_by_hand() -> None:
     """Ahead is north: the camera's forward is north, right east, down down; turns likewise."""
     diagonal = np.diag([1.0, 2, 3, 4, 5, 6])  # about right, down, forward; along the same
-    pose = vehicle_pose((0, 0, 0), ALONG_X, diagonal, Mounting())
+    pose = vehicle_pose((0, 0, 0), ALONG_X, diagonal, mounted())
     assert pose.covariance is not None
     np.testing.assert_allclose(np.diag(pose.covariance), [6, 4, 5, 3, 1, 2], atol=1e-12)
     triangle = pose.upper_triangle()
@@ -92,7 +97,10 @@ def test_covariance_of_a_level_camera_is_turned_by_hand() -> None:
 
 
 def test_covariance_is_what_small_turns_and_shifts_make_of_the_pose() -> None:
-    mounting = Mounting(10, -35, 20, (0.4, -0.1, 0.3), heading_deg=70)
+    mounting = mounted(
+        mount_roll_deg=10, mount_pitch_deg=-35, mount_yaw_deg=20, mount_m=[0.4, -0.1, 0.3],
+        world_heading_deg=70,
+    )  # fmt: skip
     rng = np.random.default_rng(3)
     wRc = rotation(0.3, -0.4, 1.1) @ rotation(*np.radians([-90, 0, -90]))
     position = np.array([1.0, -2.0, 1.5])
