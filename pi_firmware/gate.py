@@ -14,7 +14,6 @@ same at both sizes, and the scaling costs a hundredth of a millisecond.
 
 from __future__ import annotations
 
-import enum
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -75,21 +74,20 @@ def measure(luma: NDArray[np.uint8]) -> Measure:
     return Measure(entropy_bits(luma), gradient_energy(luma), block_means(luma))
 
 
-class Decision(enum.Enum):
-    """What becomes of a captured frame."""
-
-    PASS = "pass"
-    GATED = "gated"
-    HEARTBEAT = "heartbeat"
-
-
 @dataclass(frozen=True)
 class Verdict:
-    """A decision and why; `difference` from the last frame sent, grey levels, None before one."""
+    """Whether a frame passes, and why; a heartbeat does whatever the `reason` against it.
 
-    decision: Decision
+    `difference` from the last frame sent, grey levels, is None before one.
+    """
+
     reason: Reason
+    heartbeat: bool = False
     difference: float | None = None
+
+    @property
+    def passed(self) -> bool:
+        return self.heartbeat or self.reason is Reason.PASS
 
 
 class Gate:
@@ -107,15 +105,11 @@ class Gate:
         """The verdict on a frame captured at `now_ns` on a clock that does not jump."""
         difference = self._difference(measured.blocks)
         reason = self._reason(measured, difference)
-        if reason is Reason.PASS:
-            decision = Decision.PASS
-        elif self._silent_ns(now_ns) >= self._settings.heartbeat_s * 1e9 > 0:
-            decision = Decision.HEARTBEAT
-        else:
-            return Verdict(Decision.GATED, reason, difference)
-        self._last_passed_ns = now_ns
-        self._sent = measured.blocks
-        return Verdict(decision, reason, difference)
+        beats = self._silent_ns(now_ns) >= self._settings.heartbeat_s * 1e9 > 0
+        verdict = Verdict(reason, beats and reason is not Reason.PASS, difference)
+        if verdict.passed:
+            self._last_passed_ns, self._sent = now_ns, measured.blocks
+        return verdict
 
     def _reason(self, measured: Measure, difference: float | None) -> Reason:
         """Every test is made on every frame, so that its hysteresis knows all of them."""

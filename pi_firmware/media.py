@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pi_firmware import encoder, gstreamer
-from pi_firmware.gate import Decision, Gate, Measure, Verdict, attach_luma, luma_branch, measure
+from pi_firmware.gate import Gate, Measure, Verdict, attach_luma, luma_branch, measure
 from pi_firmware.settings import Settings
 from pi_firmware.sources.base import Source
 from pi_firmware.wire import annexb, sei
@@ -195,8 +195,7 @@ class Media:
         if verdict is None and self.error is None and not self._stopped:
             self.error = StreamError("a frame came to the encoder that the gate had not seen")
         result = self._gst.PadProbeReturn
-        passes = verdict is not None and verdict.decision is not Decision.GATED
-        return result.OK if passes else result.DROP
+        return result.OK if verdict is not None and verdict.passed else result.DROP
 
     def _judge(self, luma: NDArray[np.uint8], running_ns: int) -> Verdict:
         stamp = self._source.stamp(running_ns)
@@ -210,7 +209,7 @@ class Media:
             sharpness=measured.sharpness,
             exposure_s=stamp.exposure_s,
             gain=stamp.gain,
-            heartbeat=verdict.decision is Decision.HEARTBEAT,
+            heartbeat=verdict.heartbeat,
         )
         self.counters.captured += 1
         self.counters.heartbeats += info.heartbeat
@@ -218,7 +217,7 @@ class Media:
         if not self._repeats(measured):
             self.alive = self.last_captured_s is not None
             self.last_captured_s = now_s
-        if verdict.decision is Decision.GATED:
+        if not verdict.passed:
             self.counters.gated += 1
         else:
             if self._source.window is not None:

@@ -14,7 +14,7 @@ from pi_firmware.battery import Monitor, open_gauge
 from pi_firmware.battery.chip import Gauge
 from pi_firmware.capture import Capture, UnrecoverableError
 from pi_firmware.commands import Commands, actions
-from pi_firmware.gate import Decision, Verdict
+from pi_firmware.gate import Verdict
 from pi_firmware.ground import Ground
 from pi_firmware.media import Counters, Unit
 from pi_firmware.recording import Recorder
@@ -50,7 +50,7 @@ class Reporter:
                 time_ns=time.time_ns(),
                 capture_ns=info.time_ns,
                 sequence=info.sequence,
-                passed=verdict.decision is not Decision.GATED,
+                passed=verdict.passed,
                 heartbeat=info.heartbeat,
                 entropy_bits=info.entropy_bits,
                 sharpness=info.sharpness,
