@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 
 from pi_firmware import gstreamer
@@ -20,10 +19,10 @@ from pi_firmware.wire.errors import BlimpError, StreamError
 _POLL_NS = 50_000_000
 _START_FACTOR = 2.0  # a camera takes longer to its first frame than from frame to frame
 _LONGEST_PAUSE_S = 2.0
-_ENCODER, _CAMERA = "encoder", "camera"
+ENCODER, CAMERA = "encoder", "camera"
 _STARTED_ANEW = {
-    _CAMERA: messages.EVENT_CAMERA_RESTARTED,
-    _ENCODER: messages.EVENT_ENCODER_RESTARTED,
+    CAMERA: messages.EVENT_CAMERA_RESTARTED,
+    ENCODER: messages.EVENT_ENCODER_RESTARTED,
 }
 
 
@@ -31,14 +30,6 @@ class UnrecoverableError(StreamError):
     """Starting again inside the process has not helped: the process must be."""
 
     restart = True
-
-
-@dataclass
-class Restarts:
-    """Times that the camera and the encoder were restarted since the program's start."""
-
-    camera: int = 0
-    encoder: int = 0
 
 
 class Capture:
@@ -56,7 +47,8 @@ class Capture:
         announce: Callable[[str, str], None],
     ) -> None:
         self.counters = Counters()
-        self.restarts = Restarts()
+        self.restarts = dict.fromkeys(_STARTED_ANEW, 0)
+        """How often the `CAMERA` and the `ENCODER` were restarted since the program's start."""
         self._settings = settings
         self._decided, self._leave, self._announce = decided, leave, announce
         self._gst = gstreamer.load()
@@ -128,7 +120,7 @@ class Capture:
         kinds = self._gst.MessageType.ERROR | self._gst.MessageType.EOS
         message = media.bus.timed_pop_filtered(_POLL_NS, kinds)
         if media.error is not None:
-            self._fail(_CAMERA, _as_blimp_error(media.error))
+            self._fail(CAMERA, _as_blimp_error(media.error))
         elif message is not None and message.type == self._gst.MessageType.EOS:
             if source.error is None:
                 media.settle()
@@ -140,7 +132,7 @@ class Capture:
             if source.error is not None:
                 self._give_up(source.error)
                 return True
-            what = _ENCODER if message.src.get_name() == "encoder" else _CAMERA
+            what = ENCODER if message.src.get_name() == "encoder" else CAMERA
             self._fail(what, StreamError(f"video pipeline: {text}"))
         elif self.live and not self._ending:
             self._watch(media)
@@ -252,7 +244,7 @@ class Capture:
             self._open()
             self.start()
         except BlimpError as error:
-            self._fail(_CAMERA, error)
+            self._fail(CAMERA, error)
 
     def close(self) -> None:
         """Stops and releases everything; raises `UnrecoverableError` for what hangs."""
@@ -278,13 +270,13 @@ class Capture:
             self._announce(messages.EVENT_STREAMING_AGAIN, str(self.counters))
         waiting_s = media.waiting_since_s
         if waiting_s is not None and now_s - waiting_s > limit_s:
-            self._fail(_ENCODER, StreamError(f"the encoder gave no frame for {limit_s:g} s"))
+            self._fail(ENCODER, StreamError(f"the encoder gave no frame for {limit_s:g} s"))
         elif media.last_captured_s is None:
             limit_s *= _START_FACTOR
             if now_s - self._started_s > limit_s + frame_s:
-                self._fail(_CAMERA, StreamError(f"the camera gave no first frame in {limit_s:g} s"))
+                self._fail(CAMERA, StreamError(f"the camera gave no first frame in {limit_s:g} s"))
         elif now_s - media.last_captured_s > limit_s + frame_s:
-            self._fail(_CAMERA, StreamError(f"the camera gave no new frame for {limit_s:g} s"))
+            self._fail(CAMERA, StreamError(f"the camera gave no new frame for {limit_s:g} s"))
 
     def _fail(self, what: str, error: BlimpError) -> None:
         """Closes both; they are opened again after a pause, or `UnrecoverableError` is raised."""
@@ -297,7 +289,7 @@ class Capture:
                 f"{error}; {limit} restarts of camera and encoder did not help"
             )
         self._in_a_row += 1
-        setattr(self.restarts, what, getattr(self.restarts, what) + 1)
+        self.restarts[what] += 1
         pause_s = 0.0 if self._in_a_row == 1 else min(0.25 * 2**self._in_a_row, _LONGEST_PAUSE_S)
         self._due_s = time.monotonic() + pause_s
         self._announce(_STARTED_ANEW[what], str(error))

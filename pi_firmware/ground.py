@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 from pi_firmware.capture import Capture
 from pi_firmware.link import DISCOVERED, Link
@@ -19,16 +18,6 @@ _FOLLOWED_SILENT_S = 3.0
 IDR_GAP_S = 0.04
 """An IDR is a few frames' size: no ground station has every frame of 30 a second made one."""
 _LOWEST_PORT, _HIGHEST_PORT = 1, 65_535
-
-
-@dataclass(frozen=True)
-class Seen:
-    """The newest report of the video: the share of packets lost, and the round trip."""
-
-    ground: str
-    lost: float
-    round_trip_s: float | None
-    heard_s: float
 
 
 class Ground:
@@ -61,13 +50,13 @@ class Ground:
         """The ground station that was found and gets the video; empty while there is none."""
         self._followed_s = 0.0
         self._idr_s = float("-inf")
-        self._seen: Seen | None = None
+        self._seen: tuple[float, LinkReport] | None = None
 
     @property
-    def seen(self) -> Seen | None:
+    def seen(self) -> LinkReport | None:
         """The newest report of our video; None when none came within 5 s."""
-        seen = self._seen
-        return seen if seen and self._clock() - seen.heard_s < _SILENT_S else None
+        heard_s, report = self._seen or (float("-inf"), None)
+        return report if self._clock() - heard_s < _SILENT_S else None
 
     def heard(self, report: LinkReport) -> None:
         """Takes a report; on any thread. One that cannot be changes nothing."""
@@ -83,7 +72,7 @@ class Ground:
             if report.wants_idr:
                 wanted = now_s - self._idr_s >= IDR_GAP_S
                 self._idr_s = now_s if wanted else self._idr_s
-            self._seen = Seen(report.ground, report.lost, report.round_trip_s, now_s)
+            self._seen = now_s, report
         if report.wants_idr:  # of an IDR, and not of the link
             if wanted:
                 self._capture.force_idr()

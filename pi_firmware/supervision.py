@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pi_firmware.autopilot import Autopilot
-from pi_firmware.capture import Capture
+from pi_firmware.capture import CAMERA, ENCODER, Capture
 from pi_firmware.ground import IDR_GAP_S, Ground
 from pi_firmware.health.board import Board
 from pi_firmware.health.restarts import Restarts
@@ -268,8 +268,8 @@ class Supervision:
             wifi_signal_dBm=wifi.signal_dBm,
             wifi_quality=wifi.quality,
             wifi_restarts=wifi.restarts,
-            camera_restarts=capture.restarts.camera,
-            encoder_restarts=capture.restarts.encoder,
+            camera_restarts=capture.restarts[CAMERA],
+            encoder_restarts=capture.restarts[ENCODER],
             process_restarts=self._restarts.process_restarts,
             board_restarts=self._restarts.board_restarts,
             late=self.table.late(),
