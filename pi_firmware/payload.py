@@ -21,7 +21,7 @@ from pi_firmware.recording import Recorder
 from pi_firmware.settings import Settings
 from pi_firmware.supervision import AUTOPILOT, BATTERY, Supervision
 from pi_firmware.telemetry import Telemetry
-from pi_firmware.wire import messages, sei
+from pi_firmware.wire import keys, messages, sei
 from pi_firmware.wire.errors import BlimpError, RecordingError, StreamError
 
 _FLUSH_LIMIT_S = 10.0
@@ -96,7 +96,7 @@ class Payload:
             settings.recording,
             lambda name, text: self._reporter.announce(name, text),
             force_idr=lambda: self._capture.force_idr(),
-            payload={"payload_id": settings.payload_id, "camera": settings.camera.uri},
+            head={"payload": {"payload_id": settings.payload_id, "camera": settings.camera.uri}},
         )
         self._telemetry = Telemetry(
             settings.payload_id, settings.telemetry, tap=self._recorder.message
@@ -158,8 +158,8 @@ class Payload:
             )
             self._battery.start()
             self._autopilot.start()
-            self._telemetry.on_pose(self._on_pose)
-            self._telemetry.on_link(self._ground.heard)
+            self._telemetry.on(keys.POSE, messages.Pose, self._on_pose)
+            self._telemetry.on(keys.LINK, messages.LinkReport, self._ground.heard)
             self._telemetry.on_command(self._commands.ask)
             self._fly(stop)
         except BlimpError as error:

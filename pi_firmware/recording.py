@@ -8,15 +8,12 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pi_firmware.settings import RecordingSettings
 from pi_firmware.wire import annexb, messages, sei
 from pi_firmware.wire.errors import RecordingError
 from pi_firmware.wire.recorder import recorder, run
-from pi_firmware.wire.recorder.file import DurableFile, OpenFile
 from pi_firmware.wire.recorder.run import Unit
 
 TELEMETRY_ROOT = "/blimp"
@@ -132,23 +129,10 @@ class Recorder(recorder.Recorder):
     """Records video and telemetry into `recording.folder`, one recording at a time.
 
     The next file begins at an IDR, without a gap, when one is full or the clock was set. The
-    camera's calibration is not in it: the payload does not know it. `payload` is put into each
-    file, as the metadata table of that name.
+    camera's calibration is not in it: the payload does not know it.
     """
 
     run_type = FlightRun
-
-    def __init__(
-        self,
-        settings: RecordingSettings,
-        announce: Callable[[str, str], None],
-        *,
-        force_idr: Callable[[], object] = lambda: None,
-        payload: Mapping[str, str] | None = None,
-        open_file: OpenFile = DurableFile,
-    ) -> None:
-        head = {"payload": payload} if payload else {}
-        super().__init__(settings, announce, force_idr=force_idr, head=head, open_file=open_file)
 
     def unit(self, info: sei.FrameInfo, access_unit: bytes) -> None:
         """Records an access unit when a recording is made; never waits and never raises."""

@@ -135,16 +135,11 @@ class Telemetry:
             with contextlib.suppress(zenoh.ZError):  # of a session that another replaces now
                 self._publishers[kind].put(messages.encode(message))
 
-    def on_pose(self, take: Callable[[messages.Pose], None]) -> None:
-        """Calls `take` with each pose of this payload that the ground station publishes."""
-        self._subscribe(keys.POSE, messages.Pose, take)
+    def on(self, kind: str, of: type[M], take: Callable[[M], None]) -> None:
+        """Calls `take` with each message of a kind that a ground station publishes to this payload.
 
-    def on_link(self, take: Callable[[messages.LinkReport], None]) -> None:
-        """Calls `take` with each report of a ground station on this payload's video."""
-        self._subscribe(keys.LINK, messages.LinkReport, take)
-
-    def _subscribe(self, kind: str, of: type[M], take: Callable[[M], None]) -> None:
-        """`take` is called on a thread of the session; what is not as agreed is dropped."""
+        On a thread of the session; what is not as agreed is dropped.
+        """
 
         def received(sample: Any) -> None:
             with contextlib.suppress(TelemetryError):

@@ -50,7 +50,7 @@ GATE = messages.Gate(
 def test_a_recording_holds_exactly_what_went_in(tmp_path: Path) -> None:
     events = Events()
     settings = RecordingSettings(folder=str(tmp_path / "new"), min_free_MB=0)
-    made = Recorder(settings, events, payload={"payload_id": "blimp-1"})
+    made = Recorder(settings, events, head={"payload": {"payload_id": "blimp-1"}})
     assert made.start() == made.file == "flight-000001.mcap"
     made.message("battery", BATTERY)
     units = feed(made, range(60))

@@ -19,7 +19,7 @@ from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.autopilot.poses import PoseGate, rotation
 from pi_firmware.settings import AutopilotSettings, TelemetrySettings
 from pi_firmware.telemetry import Telemetry
-from pi_firmware.wire import messages
+from pi_firmware.wire import keys, messages
 
 NOW_NS = 77
 LIMIT_S = 20.0
@@ -91,7 +91,7 @@ def test_poses_reach_the_payload_they_are_of() -> None:
         settings = TelemetrySettings(connect=list(listener.endpoints))
         payloads = {name: Telemetry(name, settings) for name in heard}
         for name, telemetry in payloads.items():
-            telemetry.on_pose(heard[name].put)
+            telemetry.on(keys.POSE, messages.Pose, heard[name].put)
         feed = PoseFeed(listener.session)
         deadline = time.monotonic() + LIMIT_S
         sequence = 0
