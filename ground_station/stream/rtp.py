@@ -56,23 +56,34 @@ class Packet:
         return self.arrival_ns - self.waited_ns
 
 
+def header_bytes(packet: bytes) -> int | None:
+    """What an RTP packet's header takes, with CSRCs and extension.
+
+    None when it is not whole, not of version 2, or of no payload type of the video's.
+    """
+    if len(packet) < HEADER_BYTES or packet[0] >> 6 != 2:
+        return None
+    if packet[1] & 0x7F not in video.PAYLOAD_TYPES:
+        return None
+    size = HEADER_BYTES + 4 * (packet[0] & 0x0F)
+    if packet[0] & 0x10:  # header extension
+        if len(packet) < size + 4:
+            return None
+        size += 4 + 4 * int(struct.unpack_from(">H", packet, size + 2)[0])
+    return size if size <= len(packet) else None
+
+
 def parse(datagram: bytes, arrival_ns: int, waited_ns: int = 0) -> Packet | None:
     """The packet in a datagram; None when it is not RTP version 2 with a payload type of the video.
 
     Of a retransmission and a correction `ssrc` is their own stream's, and not the original's.
     """
-    if len(datagram) < HEADER_BYTES:
+    start = header_bytes(datagram)
+    if start is None:
         return None
     first, second, sequence, timestamp, ssrc = struct.unpack_from(">BBHII", datagram)
     kind = second & 0x7F
-    if first >> 6 != 2 or kind not in video.PAYLOAD_TYPES:
-        return None
     again, corrects = kind == video.RTX_PAYLOAD_TYPE, kind == video.CORRECTION_PAYLOAD_TYPE
-    start = HEADER_BYTES + 4 * (first & 0x0F)
-    if first & 0x10:  # header extension
-        if len(datagram) < start + 4:
-            return None
-        start += 4 + 4 * int(struct.unpack_from(">H", datagram, start + 2)[0])
     end = len(datagram)
     if first & 0x20:  # padding; its last byte counts it
         end -= datagram[-1]

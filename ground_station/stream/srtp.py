@@ -12,17 +12,15 @@ import hmac
 import struct
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
 from ground_station.stream.counters import Counters
-from ground_station.stream.rtp import MAX_JUMP
+from ground_station.stream.rtp import MAX_JUMP, header_bytes
 from pi_firmware.wire import keys as names
-from pi_firmware.wire import video
 from pi_firmware.wire.errors import StreamError, TelemetryError, os_errors_as
-from pi_firmware.wire.srtcp import SRTP_LABEL, SessionKeys
+from pi_firmware.wire.srtcp import SRTP_LABEL, ReplayWindow, SessionKeys
 from pi_firmware.wire.srtp import TAG_BYTES, read_key
 
 FOLDER = "srtp"
@@ -38,8 +36,6 @@ SEARCH_RATE_HZ = 20_000
 SEARCH_TAGS = 2048
 """Tags computed for one packet, at most: 1024 rollovers are three days of 240 packets a second."""
 
-_HEADER_BYTES = 12
-_WINDOW_MASK = (1 << REPLAY_WINDOW) - 1
 _ROC_LIMIT = 1 << 16
 
 
@@ -73,19 +69,11 @@ class _Packet(NamedTuple):
 
 def _parse(datagram: bytes) -> _Packet | None:
     """The packet in a datagram; None when it cannot be one of the video's."""
-    if len(datagram) < _HEADER_BYTES + TAG_BYTES:
-        return None
-    first, second, sequence, ssrc = struct.unpack_from(">BBH4xI", datagram)
-    if first >> 6 != 2 or second & 0x7F not in video.PAYLOAD_TYPES:
-        return None
     authenticated = datagram[:-TAG_BYTES]
-    size = _HEADER_BYTES + 4 * (first & 0x0F)
-    if first & 0x10:  # the header extension is not encrypted
-        if len(authenticated) < size + 4:
-            return None
-        size += 4 + 4 * int(struct.unpack_from(">H", datagram, size + 2)[0])
-    if len(authenticated) < size:
+    size = header_bytes(authenticated)
+    if size is None:
         return None
+    sequence, ssrc = struct.unpack_from(">2xH4xI", authenticated)
     return _Packet(sequence, ssrc, size, authenticated, datagram[-TAG_BYTES:])
 
 
@@ -97,31 +85,17 @@ def _made_with(begun: hmac.HMAC, roc: int, tag: bytes) -> bool:
     return hmac.compare_digest(mac.digest()[:TAG_BYTES], tag)
 
 
-@dataclass
-class _Stream:
-    """One payload's with one SSRC: its keys, its highest index, and which ones below it came."""
+class _Stream(ReplayWindow):
+    """One payload's with one SSRC: its keys, and which of its indices came."""
 
-    keys: SessionKeys
-    highest: int
-    came: int = 0  # bit n: the packet of index `highest` - n
+    def __init__(self, keys: SessionKeys, highest: int) -> None:
+        super().__init__(highest, REPLAY_WINDOW)
+        self.keys = keys
 
     def estimate(self, sequence: int) -> int:
         """The index nearest to the highest one (RFC 3711, 3.3.1); it can come out below 0."""
         ahead = (sequence - self.highest + 0x8000) % 0x10000 - 0x8000
         return self.highest + ahead
-
-    def accept(self, index: int) -> bool:
-        """Marks an authenticated index; False when it came before or is too old to tell."""
-        ahead = index - self.highest
-        if ahead > 0:
-            self.highest = index
-            self.came = (self.came << min(ahead, REPLAY_WINDOW) | 1) & _WINDOW_MASK
-            return True
-        bit = 1 << -ahead
-        if -ahead >= REPLAY_WINDOW or self.came & bit:
-            return False
-        self.came |= bit
-        return True
 
 
 class _Budget:

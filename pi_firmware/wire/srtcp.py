@@ -21,7 +21,7 @@ SRTP_LABEL, SRTCP_LABEL = 0, 3
 _AUTHENTICATION_KEY_BYTES = 20
 _INDEX_BYTES = 4  # before the tag: whether it is encrypted, and the index (RFC 3711, 3.4)
 _ENCRYPTED, _INDICES = 1 << 31, 1 << 31
-_WINDOW = 64  # packets of which it is known whether they came (RFC 3711, 3.3.2)
+_WINDOW = 64
 _SENDERS = 8
 
 
@@ -68,6 +68,27 @@ class SessionKeys:
         return _aes_cm(self._cipher, self._salt ^ ssrc << 64 ^ index << 16, data)
 
 
+class ReplayWindow:
+    """Which of a sender's packets came: of the `size` newest indices (RFC 3711, 3.3.2)."""
+
+    def __init__(self, highest: int, size: int) -> None:
+        self.highest = highest
+        self._size, self._came = size, 0  # bit n: the packet of index `highest` - n
+
+    def accept(self, index: int) -> bool:
+        """Marks an authenticated index; False when it came before or is too old to tell."""
+        ahead = index - self.highest
+        if ahead > 0:
+            self.highest = index
+            self._came = (self._came << min(ahead, self._size) | 1) & (1 << self._size) - 1
+            return True
+        bit = 1 << -ahead
+        if -ahead >= self._size or self._came & bit:
+            return False
+        self._came |= bit
+        return True
+
+
 class SrtcpProtector:
     """Protects what is said to one payload, in all its streams; from any thread.
 
@@ -95,7 +116,7 @@ class SrtcpUnprotector:
 
     def __init__(self, master: bytes) -> None:
         self._keys = SessionKeys("this payload", master, SRTCP_LABEL)
-        self._senders: dict[int, tuple[int, int]] = {}  # highest index, those below it that came
+        self._senders: dict[int, ReplayWindow] = {}
 
     def unprotect(self, datagram: bytes) -> bytes | None:
         """The RTCP packet in a datagram; None when it is not authentic, not encrypted or not new.
@@ -115,15 +136,8 @@ class SrtcpUnprotector:
         return said[:HEADER_BYTES] + self._keys.crypt(body, ssrc, index)
 
     def _is_new(self, ssrc: int, index: int) -> bool:
-        highest, came = self._senders.pop(ssrc, (index - 1, 0))
-        ahead = index - highest
-        if ahead > 0:
-            highest, came = index, (came << min(ahead, _WINDOW) | 1) & (1 << _WINDOW) - 1
-            is_new = True
-        else:
-            is_new = -ahead < _WINDOW and not came >> -ahead & 1
-            came |= 1 << -ahead if is_new else 0
-        self._senders[ssrc] = (highest, came)
+        window = self._senders.pop(ssrc, None) or ReplayWindow(index, _WINDOW)
+        self._senders[ssrc] = window  # behind those that were heard less lately
         if len(self._senders) > _SENDERS:
             del self._senders[next(iter(self._senders))]
-        return is_new
+        return window.accept(index)
