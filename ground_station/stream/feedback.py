@@ -73,14 +73,8 @@ class Tally:
     again: int = 0
 
     def __sub__(self, other: Tally) -> Tally:
-        return Tally(
-            max(0, self.packets - other.packets),
-            max(0, self.lost - other.lost),
-            max(0, self.frames - other.frames),
-            max(0, self.mended - other.mended),
-            max(0, self.corrected - other.corrected),
-            max(0, self.again - other.again),
-        )
+        before = vars(other)
+        return Tally(**{name: max(0, now - before[name]) for name, now in vars(self).items()})
 
     @property
     def share_lost(self) -> float:

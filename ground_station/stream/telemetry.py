@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +115,9 @@ class FrameCounts:
     discarded: int = 0
 
 
+_COUNTS = tuple(each.name for each in fields(FrameCounts))
+
+
 @dataclass
 class PayloadState:
     """The latest of what one payload said since it started.
@@ -138,13 +141,12 @@ class PayloadState:
         """The newest counters, of a gate's message or an event; None before the first."""
         last = self.events[-1] if self.events else None
         if last is not None and (self.gate is None or last.time_ns >= self.gate.time_ns):
-            v = last.values
-            if {"captured", "gated", "heartbeats", "sent"} <= v.keys():
-                counts = (v["captured"], v["gated"], v["heartbeats"], v["sent"])
-                return FrameCounts(*counts, discarded=v.get("discarded", 0))
-        if (g := self.gate) is None:
+            told = last.values
+            if {"captured", "gated", "heartbeats", "sent"} <= told.keys():
+                return FrameCounts(**{name: told.get(name, 0) for name in _COUNTS})
+        if self.gate is None:
             return None
-        return FrameCounts(g.captured, g.gated, g.heartbeats, g.sent, g.discarded)
+        return FrameCounts(**{name: getattr(self.gate, name) for name in _COUNTS})
 
     @property
     def ended(self) -> bool:
@@ -286,7 +288,7 @@ class TelemetryListener:
                 return
             try:
                 message = messages.decode(of, sample.payload.to_bytes())
-                _keep(state, message)
+                _keep(state, kind, message)
             except TelemetryError:
                 state.refused += 1
             self._changed.notify_all()
@@ -302,21 +304,16 @@ class TelemetryListener:
             self._changed.notify_all()
 
 
-def _keep(state: PayloadState, message: messages.Message) -> None:
-    """Puts a message into its payload's state."""
-    if isinstance(message, messages.Battery):
-        state.battery = message
-    elif isinstance(message, messages.Autopilot):
-        state.autopilot = message
-    elif isinstance(message, messages.Health):
-        state.health = message
-    elif isinstance(message, messages.Gate):
-        state.gate = message
-        state.decisions[message.sequence] = message
-        if len(state.decisions) > _KEPT_DECISIONS:
-            del state.decisions[next(iter(state.decisions))]
-    elif isinstance(message, messages.Event):
+def _keep(state: PayloadState, kind: str, message: messages.Message) -> None:
+    """Puts a message into its payload's state, whose fields are called as the kinds."""
+    if isinstance(message, messages.Event):
         if message.name == messages.EVENT_STARTED:  # a new flight counts from zero
             state.gate, state.health, state.decisions, state.events = None, None, {}, []
         state.events.append(message)
         del state.events[:-_KEPT_EVENTS]
+        return
+    setattr(state, kind, message)
+    if isinstance(message, messages.Gate):
+        state.decisions[message.sequence] = message
+        if len(state.decisions) > _KEPT_DECISIONS:
+            del state.decisions[next(iter(state.decisions))]
