@@ -7,8 +7,8 @@ import gc
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 
 from pi_firmware.autopilot import Autopilot
@@ -43,24 +43,17 @@ TELEMETRY_UP, TELEMETRY_DOWN, ARMED = "telemetry up", "telemetry down", "autopil
 _GAUGE_PAUSE_S = 35.0  # a gauge that fails is tried again this seldom at most
 
 
-@dataclass(frozen=True)
-class Task:
-    """A task that beats about every `period_s` and is late after `watchdog_s` without a beat."""
-
-    name: str
-    period_s: float
-    watchdog_s: float
-
-
 class Table:
     """When each task was last heard of. Safe from any thread.
 
-    A task is watched from its first beat, as it begins: one that this flight does without is never
-    late. An unknown name is a `KeyError`.
+    `watchdogs_s`: by a task's name, after how long without a beat it is late. It is watched from
+    its first beat, as it begins: one that this flight does without is never late.
     """
 
-    def __init__(self, tasks: Iterable[Task], clock: Callable[[], float] = time.monotonic) -> None:
-        self.tasks = {task.name: task for task in tasks}
+    def __init__(
+        self, watchdogs_s: Mapping[str, float], clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._watchdogs_s = watchdogs_s
         self._clock = clock
         self._lock = threading.Lock()
         self._heard: dict[str, float] = {}
@@ -68,7 +61,7 @@ class Table:
     def beat(self, name: str) -> None:
         """The task begins, or has done its work once more."""
         with self._lock:
-            self._heard[self.tasks[name].name] = self._clock()
+            self._heard[name] = self._clock()
 
     def late(self) -> list[str]:
         """Tasks that began and missed their watchdog since, in the table's order."""
@@ -76,13 +69,13 @@ class Table:
             now, heard = self._clock(), self._heard
             return [
                 name
-                for name, task in self.tasks.items()
-                if name in heard and now - heard[name] > task.watchdog_s
+                for name, watchdog_s in self._watchdogs_s.items()
+                if name in heard and now - heard[name] > watchdog_s
             ]
 
 
 class PeriodicThread:
-    """Runs `call` each period of a task of the table, on a thread of its own.
+    """Runs `call`, a task of the table, every `period_s` on a thread of its own.
 
     A call that returns is a beat; one that raises is reported as one line and tried again at the
     next period, so that a task that always fails becomes late. The same line is reported once a
@@ -93,10 +86,11 @@ class PeriodicThread:
         self,
         table: Table,
         name: str,
+        period_s: float,
         call: Callable[[], object],
         report: Callable[[str], object],
     ) -> None:
-        self._table, self._task = table, table.tasks[name]
+        self._table, self._name, self._period_s = table, name, period_s
         self._call, self._report = call, report
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -106,7 +100,7 @@ class PeriodicThread:
 
     def start(self) -> None:
         """Starts the thread, whose first call is at once."""
-        self._table.beat(self._task.name)
+        self._table.beat(self._name)
         self._thread.start()
 
     def stop(self) -> None:
@@ -120,11 +114,11 @@ class PeriodicThread:
             try:
                 self._call()
             except Exception as error:  # whatever it is, a flight does not end for one task
-                self._fault(f"{self._task.name}: {type(error).__name__}: {error}")
+                self._fault(f"{self._name}: {type(error).__name__}: {error}")
             else:
-                self._table.beat(self._task.name)
+                self._table.beat(self._name)
             now = time.monotonic()
-            due = max(due + self._task.period_s, now)
+            due = max(due + self._period_s, now)
             self._end.wait(due - now)
 
     def _fault(self, line: str) -> None:
@@ -139,22 +133,22 @@ class PeriodicThread:
             self._report(line + again)
 
 
-def tasks(settings: Settings) -> tuple[Task, ...]:
-    """All that must happen again and again: how often, and when it is late.
+def tasks(settings: Settings) -> dict[str, float]:
+    """All that must happen again and again, and when it is late, s.
 
     `video` beats with each frame that leaves the encoder, `battery` with each believable reading,
     `autopilot` with each of its states.
     """
     camera, battery = settings.camera, settings.battery
     period_s, limit_s = settings.supervision.period_s, settings.supervision.frame_timeout_s
-    return (
-        Task(VIDEO, 1 / camera.rate_hz, limit_s + 1.5 / camera.rate_hz),
-        Task(BATTERY, battery.period_s, 3 * battery.period_s + _GAUGE_PAUSE_S),
-        Task(AUTOPILOT, settings.autopilot.period_s, 3 * settings.autopilot.period_s + 5),
-        Task(HEALTH, period_s, 3 * period_s + 5),
-        Task(CLOCK, _CLOCK_S, 3 * _CLOCK_S),
-        Task(MEMORY, _MEMORY_S, 3 * _MEMORY_S),
-    )
+    return {
+        VIDEO: limit_s + 1.5 / camera.rate_hz,
+        BATTERY: 3 * battery.period_s + _GAUGE_PAUSE_S,
+        AUTOPILOT: 3 * settings.autopilot.period_s + 5,
+        HEALTH: 3 * period_s + 5,
+        CLOCK: 3 * _CLOCK_S,
+        MEMORY: 3 * _MEMORY_S,
+    }
 
 
 class Supervision:
@@ -223,9 +217,12 @@ class Supervision:
                 self._tell_refusals(telemetry)
 
         self._threads = [
-            PeriodicThread(self.table, HEALTH, publish, _complain),
-            PeriodicThread(self.table, CLOCK, ask, _complain),
-            PeriodicThread(self.table, MEMORY, gc.collect, _complain),
+            PeriodicThread(self.table, name, period_s, call, _complain)
+            for name, period_s, call in (
+                (HEALTH, self._settings.supervision.period_s, publish),
+                (CLOCK, _CLOCK_S, ask),
+                (MEMORY, _MEMORY_S, gc.collect),
+            )
         ]
         self.table.beat(VIDEO)
         for thread in self._threads:

@@ -12,7 +12,7 @@ from waiting import eventually
 
 from pi_firmware import supervision
 from pi_firmware.settings import Settings
-from pi_firmware.supervision import PeriodicThread, Table, Task
+from pi_firmware.supervision import PeriodicThread, Table
 
 PROGRAM = """
 import gc, sys
@@ -39,9 +39,7 @@ class Hand:
 
 def test_late_is_who_began_and_was_not_heard_within_its_watchdog() -> None:
     clock = Hand()
-    table = Table(
-        [Task("health", 1.0, 5.0), Task("gone", 1.0, 9.0), Task("wifi", 1.0, 30.0)], clock
-    )
+    table = Table({"health": 5.0, "gone": 9.0, "wifi": 30.0}, clock)
     clock.now_s += 1000
     assert table.late() == [], "nobody has begun"
     table.beat("wifi")
@@ -58,7 +56,7 @@ def test_late_is_who_began_and_was_not_heard_within_its_watchdog() -> None:
 
 def test_a_call_that_raises_is_told_once_goes_on_and_does_not_beat() -> None:
     clock = Hand()
-    table = Table([Task("poor", 0.01, 5.0)], clock)
+    table = Table({"poor": 5.0}, clock)
     calls: list[str] = []
     told: list[str] = []
 
@@ -73,7 +71,7 @@ def test_a_call_that_raises_is_told_once_goes_on_and_does_not_beat() -> None:
         told.append(line)
         raise RuntimeError("and telling of it fails, too")
 
-    runner = PeriodicThread(table, "poor", poor, report)
+    runner = PeriodicThread(table, "poor", 0.01, poor, report)
     runner.start()
     eventually(lambda: len(calls) >= 22)
     assert told == ["poor: OSError: no such gauge"] and set(calls) == {"poor"}
@@ -92,7 +90,7 @@ def test_each_new_reason_is_told() -> None:
         calls.append(1)
         raise ValueError(len(calls) % 2)
 
-    runner = PeriodicThread(Table([Task("poor", 0.01, 5.0)]), "poor", poor, told.append)
+    runner = PeriodicThread(Table({"poor": 5.0}), "poor", 0.01, poor, told.append)
     runner.start()
     eventually(lambda: len(calls) >= 3)
     runner.stop()
@@ -102,8 +100,8 @@ def test_each_new_reason_is_told() -> None:
 def test_stopping_a_hung_task_does_not_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervision, "_JOIN_LIMIT_S", 0.05)
     release = threading.Event()
-    table = Table([Task("hung", 0.01, 5.0)])
-    runner = PeriodicThread(table, "hung", lambda: release.wait(20.0), print)
+    table = Table({"hung": 5.0})
+    runner = PeriodicThread(table, "hung", 0.01, lambda: release.wait(20.0), print)
     runner.start()
     began_s = time.monotonic()
     runner.stop()
@@ -119,7 +117,7 @@ def test_missed_periods_are_not_made_up_for() -> None:
         if len(began) == 1:
             time.sleep(0.7)  # three periods and a half
 
-    runner = PeriodicThread(Table([Task("slow", 0.2, 5.0)]), "slow", slow, print)
+    runner = PeriodicThread(Table({"slow": 5.0}), "slow", 0.2, slow, print)
     runner.start()
     eventually(lambda: len(began) >= 4)
     runner.stop()
@@ -140,7 +138,8 @@ def test_a_flight_empties_cpythons_lists_of_freed_objects(monkeypatch: pytest.Mo
         assert collected.wait(20)
     finally:
         watching.stop()
-    assert watching.table.tasks[supervision.MEMORY].period_s <= 60
+    (thread,) = (each for each in watching._threads if each._name == supervision.MEMORY)
+    assert thread._period_s <= 60
 
 
 def test_the_program_freezes_what_it_loaded_before_it_flies() -> None:
