@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from pi_firmware import gstreamer
 from pi_firmware.settings import CameraSettings
@@ -27,24 +27,11 @@ with a receive buffer of 4 MB as with one of 208 kB.
 """
 
 
-class Pace(Protocol):
-    """Waits for each frame's turn."""
-
-    ahead_frames: int
-    """How many frames may wait in front of the pipeline."""
-
-    def turn(self, time_ns: int) -> int | None:
-        """Waits for the turn of the frame captured at `time_ns`, the first frame's being at once.
-
-        Returns its running time in the pipeline, ns; None when the waiting was interrupted.
-        """
-        ...
-
-
 class RealTime:
     """Each frame at its recorded instant, `speed` times as fast, on the pipeline's clock."""
 
     ahead_frames = 4
+    """How many frames may wait in front of the pipeline."""
 
     def __init__(self, speed: float, now: Callable[[], int], stopping: threading.Event) -> None:
         self._speed = speed
@@ -53,6 +40,10 @@ class RealTime:
         self._start: tuple[int, int] | None = None
 
     def turn(self, time_ns: int) -> int | None:
+        """Waits for the turn of the frame captured at `time_ns`, the first frame's being at once.
+
+        Returns its running time in the pipeline, ns; None when the waiting was interrupted.
+        """
         if self._start is None:
             self._start = self._now(), time_ns
         start_ns, first_ns = self._start
@@ -82,6 +73,7 @@ class Stepped:
         self._previous_s = -self._least_s
 
     def turn(self, time_ns: int) -> int | None:
+        """As `RealTime.turn`."""
         if self._first_ns is None:
             self._first_ns = time_ns
         else:
@@ -206,7 +198,7 @@ class ReplaySource(Source):
         finally:
             source.emit("end-of-stream")
 
-    def _chosen_pace(self, uri: Uri) -> Pace:
+    def _chosen_pace(self, uri: Uri) -> RealTime | Stepped:
         name = uri.choice("pace", "realtime", PACES)
         for pace, options in _OF_PACE.items():
             for option in options:
