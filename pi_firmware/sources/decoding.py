@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pi_firmware import gstreamer
-from pi_firmware.wire.annexb import NO_PARAMETER_SETS, has_parameter_sets
+from pi_firmware.wire.annexb import NAL_PPS, NAL_SPS, NO_PARAMETER_SETS, nal_types
 from pi_firmware.wire.errors import BlimpError, RecordingError
 from pi_firmware.wire.recording import FRAME_INFO_TOPIC, RecordingReader
 
@@ -92,12 +92,13 @@ class RecordingDecoder:
     def _feed(self) -> None:
         gst = gstreamer.load()
         first_ns: int | None = None
-        saw_sets = False
+        missing = {NAL_SPS, NAL_PPS}
         try:
             for sample in self._reader.video():
                 if first_ns is None:
                     first_ns = sample.time_ns
-                saw_sets = saw_sets or has_parameter_sets(sample.data)
+                if missing:
+                    missing -= set(nal_types(sample.data))
                 pts = sample.time_ns - first_ns
                 if pts < 0:
                     continue
@@ -108,7 +109,7 @@ class RecordingDecoder:
                     return
             if first_ns is None:
                 raise RecordingError(f"{self._path}: the recording has no video")
-            if not saw_sets:
+            if missing:
                 raise RecordingError(f"{self._path}: {NO_PARAMETER_SETS}")
             self.cut_reason = self._reader.cut_reason if self._reader.cut else ""
         except BlimpError as error:

@@ -42,16 +42,6 @@ def nal_types(data: bytes) -> list[int]:
     return [nal_type(unit) for unit in nal_units(data)]
 
 
-def has_parameter_sets(data: bytes) -> bool:
-    """Whether a byte stream holds both a sequence and a picture parameter set."""
-    missing = {NAL_SPS, NAL_PPS}
-    for unit in nal_units(data):
-        missing.discard(nal_type(unit))
-        if not missing:
-            return True
-    return False
-
-
 def is_idr(data: bytes) -> bool:
     """Whether an access unit is an IDR picture, from which decoding can start.
 

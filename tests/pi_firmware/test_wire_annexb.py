@@ -37,5 +37,6 @@ def test_an_access_unit_without_a_slice_takes_no_unit() -> None:
 def test_real_streams_with_and_without_parameter_sets_are_told_apart() -> None:
     if not STREAMS.is_dir():
         pytest.skip("shared/data/streams is not here")
-    assert annexb.has_parameter_sets((STREAMS / "tello.h264").read_bytes())
-    assert not annexb.has_parameter_sets((STREAMS / "tello-no-parameter-sets.h264").read_bytes())
+    sets = {annexb.NAL_SPS, annexb.NAL_PPS}
+    assert sets <= {*annexb.nal_types((STREAMS / "tello.h264").read_bytes())}
+    assert not sets & {*annexb.nal_types((STREAMS / "tello-no-parameter-sets.h264").read_bytes())}

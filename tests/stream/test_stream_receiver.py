@@ -147,7 +147,8 @@ def test_a_real_cameras_stream_gives_a_picture_for_each_access_unit() -> None:
         pytest.skip("shared/data/streams is not here")
     with av.open(str(path)) as container:
         units = [bytes(packet) for packet in container.demux(video=0) if packet.size]
-    start = next(i for i, unit in enumerate(units) if annexb.has_parameter_sets(unit))
+    sets = {annexb.NAL_SPS, annexb.NAL_PPS}
+    start = next(i for i, unit in enumerate(units) if sets <= {*annexb.nal_types(unit)})
     stamps = [stamped(unit, index) for index, unit in enumerate(units[start : start + 60])]
     stream = Stream()
     frames = stream.frames(packets(stamps))
