@@ -31,50 +31,6 @@ _RENEWED_S = 10.0
 """A session that was opened again hears the ground station within this."""
 
 
-class Reporter:
-    """Turns verdicts and events into messages with the counters of their moment.
-
-    Safe from any thread. `counters` are set once there are some.
-    """
-
-    def __init__(self, settings: Settings, ssrc: int, telemetry: Telemetry) -> None:
-        self.counters = Counters()
-        self._settings = settings
-        self._ssrc = ssrc
-        self._telemetry = telemetry
-
-    def gate(self, info: sei.FrameInfo, verdict: Verdict) -> None:
-        """The gate's decision on a frame."""
-        self._telemetry.publish(
-            messages.Gate(
-                time_ns=time.time_ns(),
-                capture_ns=info.time_ns,
-                sequence=info.sequence,
-                passed=verdict.passed,
-                heartbeat=info.heartbeat,
-                entropy_bits=info.entropy_bits,
-                sharpness=info.sharpness,
-                ssrc=self._ssrc,
-                reason=verdict.reason,
-                difference=verdict.difference,
-                **vars(self.counters),
-            ),
-        )
-
-    def announce(self, name: str, text: str) -> None:
-        """An event, with the counters and the stream's properties."""
-        camera = self._settings.camera
-        values = {
-            "ssrc": self._ssrc,
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
-            **vars(self.counters),
-        }
-        self._telemetry.publish(
-            messages.Event(time_ns=time.time_ns(), name=name, text=text, values=values),
-        )
-
-
 class Payload:
     """One flight of the payload: build it, `run` it, `close` it.
 
@@ -86,15 +42,17 @@ class Payload:
         gauge = open_gauge(settings.battery.uri, settings.battery)
         self.settings = settings
         self.ssrc = link.draw_ssrc(settings.link)
+        self.counters = Counters()
+        """Those of the capture, once there is one."""
         self._stop = threading.Event()
         self._afterwards: list[str] = []
         self._looks_s, self._renewed = 0.0, False
-        self._autopilot = open_autopilot(settings.autopilot, lambda s: self._tell_autopilot(s))
+        self._autopilot = open_autopilot(settings.autopilot, self._tell_autopilot)
         key = link.load_key(settings.telemetry.certificates) if settings.link.encrypted else None
         self._link = link.Link(settings.link, self.ssrc, key)
         self._recorder = Recorder(
             settings.recording,
-            lambda name, text: self._reporter.announce(name, text),
+            self._announce,
             force_idr=lambda: self._capture.force_idr(),
             head={"payload": {"payload_id": settings.payload_id, "camera": settings.camera.uri}},
         )
@@ -109,15 +67,14 @@ class Payload:
 
     def _build(self, gauge: Gauge) -> None:
         settings = self.settings
-        self._reporter = Reporter(settings, self.ssrc, self._telemetry)
-        announce = self._reporter.announce
+        announce = self._announce
         self._supervision = Supervision(settings, announce)
         if self._supervision.begin():
             announce(messages.EVENT_FAILED, "no frames from several processes: rebooting the board")
             _run_last(settings.supervision.reboot_command)
             raise UnrecoverableError("no frames from several processes in a row")
-        self._capture = Capture(settings, self._reporter.gate, self._leave, announce)
-        self._reporter.counters = self._capture.counters
+        self._capture = Capture(settings, self._tell_gate, self._leave, announce)
+        self.counters = self._capture.counters
         self._ground = Ground(
             settings.link,
             self.ssrc,
@@ -138,7 +95,7 @@ class Payload:
             actions(
                 settings, self._capture, self._recorder, self._end, lambda: self._autopilot.armed
             ),
-            lambda text: self._reporter.announce(messages.EVENT_COMMAND, text),
+            lambda text: self._announce(messages.EVENT_COMMAND, text),
         )
 
     def run(self, stop: threading.Event) -> None:
@@ -147,7 +104,7 @@ class Payload:
         Raises `BlimpError` when camera, encoder or link fail on the way.
         """
         self._stop = stop
-        announce = self._reporter.announce
+        announce = self._announce
         started = f"streaming {self.settings.camera.uri}, {self._supervision.release}"
         announce(messages.EVENT_STARTED, started)
         try:
@@ -164,7 +121,7 @@ class Payload:
             self._fly(stop)
         except BlimpError as error:
             announce(messages.EVENT_FAILED, str(error))
-            if isinstance(error, UnrecoverableError) and self._supervision.give_up():
+            if isinstance(error, UnrecoverableError) and self._supervision.may_reboot(ending=True):
                 self._afterwards = self.settings.supervision.reboot_command
             raise
         if self.cut_reason:
@@ -172,10 +129,6 @@ class Payload:
         self._battery.stop()  # what ended the flight is told before its end
         name = messages.EVENT_STOPPED if stop.is_set() else messages.EVENT_END_OF_STREAM
         announce(name, str(self.counters))
-
-    @property
-    def counters(self) -> Counters:
-        return self._capture.counters
 
     @property
     def cut_reason(self) -> str:
@@ -246,6 +199,37 @@ class Payload:
             return self.counters.captured
         return self._capture.encoded
 
+    def _tell_gate(self, info: sei.FrameInfo, verdict: Verdict) -> None:
+        """The gate's decision on a frame."""
+        self._telemetry.publish(
+            messages.Gate(
+                time_ns=time.time_ns(),
+                capture_ns=info.time_ns,
+                sequence=info.sequence,
+                passed=verdict.passed,
+                heartbeat=info.heartbeat,
+                entropy_bits=info.entropy_bits,
+                sharpness=info.sharpness,
+                ssrc=self.ssrc,
+                reason=verdict.reason,
+                difference=verdict.difference,
+                **vars(self.counters),
+            )
+        )
+
+    def _announce(self, name: str, text: str) -> None:
+        """An event, with the counters and the stream's properties; from any thread."""
+        camera = self.settings.camera
+        values = {
+            "ssrc": self.ssrc,
+            "width_px": camera.width_px,
+            "height_px": camera.height_px,
+            **vars(self.counters),
+        }
+        self._telemetry.publish(
+            messages.Event(time_ns=time.time_ns(), name=name, text=text, values=values)
+        )
+
     def _tell_battery(self, message: messages.Battery) -> None:
         self._supervision.table.beat(BATTERY)
         self._telemetry.publish(message)
@@ -272,7 +256,7 @@ class Payload:
         try:
             self._recorder.start()
         except RecordingError as error:
-            self._reporter.announce(messages.EVENT_RECORDING_ENDED, str(error))
+            self._announce(messages.EVENT_RECORDING_ENDED, str(error))
 
 
 def _run_last(command: list[str]) -> None:

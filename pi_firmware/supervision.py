@@ -185,11 +185,12 @@ class Supervision:
     def begin(self) -> bool:
         """Counts this process; whether the board is to be rebooted because the last ones failed."""
         self._restarts.begin()
-        return self._may_reboot(ending=False)
+        return self.may_reboot(ending=False)
 
-    def give_up(self) -> bool:
-        """This process ends because it has no frames; whether the board is to be rebooted."""
-        return self._may_reboot(ending=True)
+    def may_reboot(self, *, ending: bool) -> bool:
+        """Whether the board is to be rebooted now: as `Restarts.claim_reboot`, if it knows how."""
+        knows_how = bool(self._settings.supervision.reboot_command)
+        return knows_how and self._restarts.claim_reboot(ending=ending)
 
     def start(
         self,
@@ -303,11 +304,6 @@ class Supervision:
             if line not in self._refusals:
                 self._refusals.add(line)
                 _complain(f"telemetry: {line}")
-
-    def _may_reboot(self, *, ending: bool) -> bool:
-        if not self._settings.supervision.reboot_command:
-            return False
-        return self._restarts.claim_reboot(ending=ending)
 
 
 def _complain(line: str) -> None:
