@@ -68,7 +68,7 @@ class Commands:
 
     def carry_out(self, name: str, command: Command) -> Answer:
         try:
-            values = self._checked(name).run(**self._numbers(name, command.arguments))
+            values = self._action(name, command.arguments).run(**command.arguments)
         except BlimpError as error:
             return _refused(str(error))
         except Exception as error:  # a command must never end a flight
@@ -92,13 +92,11 @@ class Commands:
             forced = ", forced" if FORCED in done.values else ""
             self._announce(f"{name}: {'done' if done.done else done.reason}{forced}")
 
-    def _checked(self, name: str) -> Action:
+    def _action(self, name: str, given: Mapping[str, float]) -> Action:
+        """What a command does, which takes these numbers; raises `Refusal`."""
         if name not in self._actions:
             known = ", ".join(sorted(self._actions))
             raise Refusal(f"no command {name[:40]!r} (there are: {known})")
-        return self._actions[name]
-
-    def _numbers(self, name: str, given: Mapping[str, float]) -> dict[str, float]:
         action = self._actions[name]
         for number in given:
             if number not in action.numbers:
@@ -110,7 +108,7 @@ class Commands:
             low, high = action.numbers[number]
             if not (math.isfinite(value) and low <= value <= high):
                 raise Refusal(f"{name}: '{number}' is {value:g}; allowed: {low:g} to {high:g}")
-        return dict(given)
+        return action
 
 
 def _refused(reason: str) -> Answer:

@@ -58,15 +58,13 @@ def parse(text: str, what: str) -> Uri:
     if not colon or not scheme:
         raise SourceError(f"{what} {shown(text, 200)}: expected scheme:path?option=value")
     path, _, query = rest.partition("?")
+    parsed = Uri(text, what, scheme, path, {})
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
     except ValueError:
-        raise SourceError(f"{what} {shown(text, 200)}: the options are not name=value&…") from None
-    options: dict[str, str] = {}
+        raise parsed.fail("the options are not name=value&…") from None
     for name, value in pairs:
-        if name in options:
-            raise SourceError(
-                f"{what} {shown(text, 200)}: option {shown(name, 200)} is given twice"
-            )
-        options[name] = value
-    return Uri(text, what, scheme, path, options)
+        if name in parsed.options:
+            raise parsed.fail(f"option {shown(name, 200)} is given twice")
+        parsed.options[name] = value
+    return parsed

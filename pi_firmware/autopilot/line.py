@@ -122,7 +122,6 @@ class SerialAutopilot(Autopilot):
 
     def state(self) -> State:
         """What is known of the autopilot now, and the counters."""
-        counts = self.poses.counts
         connected = time.monotonic() - self._heard_s < _SILENT_S
         if not connected:
             self._values = {}  # what it said before it fell silent is no longer so
@@ -132,9 +131,7 @@ class SerialAutopilot(Autopilot):
             reason=self._reason,
             heartbeats=self._heartbeats,
             sent=self._sent,
-            stale=counts.stale,
-            lost=counts.lost,
-            refused=counts.refused,
+            **vars(self.poses.counts),
             reset_counter=self.poses.reset_counter,
             lines_opened=self._lines,
             **self._values,
