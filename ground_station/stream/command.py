@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pi_firmware.wire import keys, messages
 from pi_firmware.wire.errors import TelemetryError
-from pi_firmware.wire.telemetry import Session
+from pi_firmware.wire.telemetry import LOCAL_ENDPOINT, PORT, Session, open_session
 from pi_firmware.wire.text import printable
 
 NAMES = ("record-start", "record-stop", "idr", "bitrate", "exposure", "shutdown", "reboot")
@@ -127,11 +127,8 @@ def run(args: argparse.Namespace) -> int:
     """Asks and prints the answer; raises `BlimpError` with one line for bad input or none."""
     from ground_station.errors import InputError
     from ground_station.files import write_json
-    from pi_firmware.wire.errors import TelemetryError
-    from pi_firmware.wire.keys import check_payload_id
-    from pi_firmware.wire.telemetry import LOCAL_ENDPOINT, PORT, open_session
 
-    check_payload_id(args.payload)
+    keys.check_payload_id(args.payload)
     numbers = _numbers(args.arguments)
     if not 0.1 <= args.timeout_s <= 600:
         raise InputError(f"--timeout-s is {args.timeout_s:g}; allowed: 0.1 to 600")

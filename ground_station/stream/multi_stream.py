@@ -430,17 +430,14 @@ class MultiStreamReceiver:
 
     def _make_room(self, owner: str, now_ns: int) -> bool:
         """Whether a payload's new stream can be taken: its earlier one has gone, or goes now."""
-        for stream in self.streams():
-            if stream.payload_id == owner:
-                if now_ns - stream.last_ns < _GIVE_WAY_NS:
-                    return False
-                self._drop(stream)
-        if len(self._streams) < self._max_streams:
-            return True
-        silent = min(self.streams(), key=lambda stream: stream.last_ns)
-        if now_ns - silent.last_ns < _GIVE_WAY_NS:
+        streams = self.streams()
+        going = [stream for stream in streams if stream.payload_id == owner]
+        if not going and len(streams) >= self._max_streams:
+            going = [min(streams, key=lambda stream: stream.last_ns)]
+        if any(now_ns - stream.last_ns < _GIVE_WAY_NS for stream in going):
             return False
-        self._drop(silent)
+        for stream in going:
+            self._drop(stream)
         return True
 
     def _drop(self, stream: Stream) -> None:
