@@ -20,13 +20,7 @@ M = TypeVar("M", bound=messages.Message)
 _REFUSALS_LIMIT_S = 5.0
 _CLOSED_S = 12.0
 """Zenoh gives up closing a link that nobody answers on after 10 s."""
-_KINDS = {
-    messages.Battery: keys.BATTERY,
-    messages.Gate: keys.GATE,
-    messages.Event: keys.EVENT,
-    messages.Autopilot: keys.AUTOPILOT,
-    messages.Health: keys.HEALTH,
-}
+_KIND_OF = {message: kind for kind, message in messages.KINDS.items()}
 _ENDPOINT = re.compile(r"^[a-z]+/(\[[^\]]+\]|[^/:]+):\d+")
 
 Tap = Callable[[str, messages.Message], None]
@@ -93,7 +87,7 @@ class Telemetry:
                 keys.key(self._payload_id, kind),
                 congestion_control=control.BLOCK if kind == keys.EVENT else control.DROP,
             )
-            for kind in _KINDS.values()
+            for kind in messages.KINDS
         }
         self._declared = [declare(session) for declare in self._declare]
 
@@ -127,7 +121,7 @@ class Telemetry:
 
     def publish(self, message: messages.Message) -> None:
         """Publishes a message of one of the kinds that a payload tells."""
-        kind = _KINDS[type(message)]
+        kind = _KIND_OF[type(message)]
         self._tap(kind, message)
         if self._session is not None:
             import zenoh

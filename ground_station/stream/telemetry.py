@@ -87,13 +87,6 @@ class ClockFollower:
             self._offsets[payload_id] = offset
 
 
-_KINDS: dict[str, type[messages.Message]] = {
-    keys.BATTERY: messages.Battery,
-    keys.GATE: messages.Gate,
-    keys.EVENT: messages.Event,
-    keys.AUTOPILOT: messages.Autopilot,
-    keys.HEALTH: messages.Health,
-}
 LOCAL_NAME = "local"
 """What a ground station without a certificate is called."""
 _KEPT_DECISIONS = 10_000
@@ -279,7 +272,7 @@ class TelemetryListener:
     def _take(self, sample: Any) -> None:
         key = str(sample.key_expr)
         kind = key.rpartition("/")[2]
-        if (of := _KINDS.get(kind)) is None:
+        if (of := messages.KINDS.get(kind)) is None:
             return
         message: messages.Message | None = None
         with self._changed:

@@ -272,6 +272,11 @@ class Answer(Message):
     values: dict[str, float] = field(default_factory=dict)
 
 
+KINDS: dict[str, type[Message]] = {
+    kind.SCHEMA.partition(".")[2]: kind for kind in (Battery, Gate, Event, Autopilot, Health)
+}
+"""What a payload tells by itself, by the kind that its key ends with."""
+
 EVENT_STARTED = "started"
 EVENT_SOURCE_CUT = "source-cut"
 EVENT_END_OF_STREAM = "end-of-stream"
@@ -339,17 +344,16 @@ def _value(value: Any, kind: Any, what: str) -> Any:
         if value is None:
             return None
         kind = typing.get_args(kind)[0]
-    if typing.get_origin(kind) is list:
-        if not isinstance(value, list):
-            raise TelemetryError(f"{what} must be a list, not {str(value)[:60]!r}")
-        _check_count(value, what)
-        item = typing.get_args(kind)[0]
-        return [_value(v, item, f"{what}[{i}]") for i, v in enumerate(value)]
-    if typing.get_origin(kind) is dict:
-        if not isinstance(value, dict):
-            raise TelemetryError(f"{what} must be an object, not {str(value)[:60]!r}")
-        _check_count(value, what)
-        item = typing.get_args(kind)[1]
+    origin = typing.get_origin(kind)
+    if origin in (list, dict):
+        if not isinstance(value, origin):
+            expected = "a list" if origin is list else "an object"
+            raise TelemetryError(f"{what} must be {expected}, not {str(value)[:60]!r}")
+        if len(value) > MOST_ITEMS:
+            raise TelemetryError(f"{what} has {len(value)} items; allowed: {MOST_ITEMS}")
+        item = typing.get_args(kind)[-1]
+        if origin is list:
+            return [_value(v, item, f"{what}[{i}]") for i, v in enumerate(value)]
         return {k[:MOST_LETTERS]: _value(v, item, f"{what}[{k!r:.40}]") for k, v in value.items()}
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) < 2**1000 else math.inf
@@ -362,8 +366,3 @@ def _value(value: Any, kind: Any, what: str) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         raise TelemetryError(f"{what} must be finite, not {value}")
     return value
-
-
-def _check_count(value: list[Any] | dict[str, Any], what: str) -> None:
-    if len(value) > MOST_ITEMS:
-        raise TelemetryError(f"{what} has {len(value)} items; allowed: {MOST_ITEMS}")
