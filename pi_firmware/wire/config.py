@@ -60,10 +60,16 @@ def apply_override(document: dict[str, Any], override: str, cls: type | None = N
         document = document.setdefault(part, {})
         if not isinstance(document, dict):
             raise ConfigError(f"--set {shown(override)}: {shown(part)} is not a table")
-    if cls is None:
-        document[last] = _value_or_text(text)
-    else:
-        document[last] = text if _is_text([*tables, last], cls) else _toml_value(text, override)
+    if cls is not None and _is_text([*tables, last], cls):
+        document[last] = text
+        return
+    try:
+        document[last] = parse(f"value = {text}")["value"]
+    except (ValueError, KeyError, RecursionError):  # a TOMLDecodeError is a ValueError, too
+        if cls is not None:
+            what = f"--set {shown(override)}: {shown(text)}"
+            raise ConfigError(f"{what} is not a TOML value") from None
+        document[last] = text
 
 
 def _is_text(path: list[str], kind: Any) -> bool:
@@ -71,20 +77,6 @@ def _is_text(path: list[str], kind: Any) -> bool:
     for part in path:
         kind = typing.get_type_hints(kind).get(part) if dataclasses.is_dataclass(kind) else None
     return kind is str
-
-
-def _toml_value(text: str, override: str) -> Any:
-    try:
-        return parse(f"value = {text}")["value"]
-    except (ValueError, KeyError, RecursionError):  # a TOMLDecodeError is a ValueError, too
-        raise ConfigError(f"--set {shown(override)}: {shown(text)} is not a TOML value") from None
-
-
-def _value_or_text(text: str) -> Any:
-    try:
-        return _toml_value(text, text)
-    except ConfigError:
-        return text
 
 
 def range_of(cls: type, name: str) -> tuple[float, float]:
@@ -149,10 +141,7 @@ def _build(document: Mapping[str, Any], cls: type[T], where: str, prefix: str) -
     for name, field in fields.items():
         full = prefix + name
         if name not in document:
-            if (
-                field.default is dataclasses.MISSING
-                and field.default_factory is dataclasses.MISSING
-            ):
+            if field.default is field.default_factory is dataclasses.MISSING:
                 raise ConfigError(f"{where}: the key '{full}' is missing")
             continue
         value, kind = document[name], hints[name]

@@ -78,27 +78,18 @@ def check_endpoint(endpoint: str, *, certified: bool = False) -> tuple[str, int]
     With certificates (`certified`) every endpoint is `tls/`, anywhere. Without, only loopback is
     taken: beyond it nobody speaks without a certificate.
     """
-    match = _ENDPOINT.fullmatch(endpoint)
+    match, what = _ENDPOINT.fullmatch(endpoint), f"telemetry endpoint {endpoint!r:.80}:"
     if match is None or int(match[3]) > 65535:
         expected = "tls/HOST:PORT" if certified else "tcp/HOST:PORT"
-        raise TelemetryError(f"telemetry endpoint {endpoint!r:.80}: expected {expected}")
-    scheme, host = match[1], match[2].strip("[]")
-    if certified:
-        if scheme != "tls":
-            raise TelemetryError(
-                f"telemetry endpoint {endpoint!r:.80}: with certificates only tls/HOST:PORT"
-                " is allowed"
-            )
-        return match[2], int(match[3])
-    if scheme == "tls":
-        raise TelemetryError(
-            f"telemetry endpoint {endpoint!r:.80}: tls needs a folder of certificates (blimp keys)"
-        )
-    if not is_loopback(host):
-        raise TelemetryError(
-            f"telemetry endpoint {endpoint!r:.80}: only loopback is allowed without certificates"
-        )
-    return match[2], int(match[3])
+        raise TelemetryError(f"{what} expected {expected}")
+    scheme, host, port = match[1], match[2], int(match[3])
+    if certified and scheme != "tls":
+        raise TelemetryError(f"{what} with certificates only tls/HOST:PORT is allowed")
+    if not certified and scheme == "tls":
+        raise TelemetryError(f"{what} tls needs a folder of certificates (blimp keys)")
+    if not certified and not is_loopback(host.strip("[]")):
+        raise TelemetryError(f"{what} only loopback is allowed without certificates")
+    return host, port
 
 
 def is_loopback(host: str) -> bool:
