@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -154,19 +154,17 @@ class Assembly:
             self._reorderer.corrected_ns = packet.arrival_ns
         else:
             self._counters.packets += not packet.again
-            for ordered, missing in self._reorderer.push(packet):
-                yield from self._assemble(ordered, missing)
+            yield from self._assemble(self._reorderer.push(packet))
         for found in self.correction.take(packet):
-            for ordered, missing in self._reorderer.push(found):
-                yield from self._assemble(ordered, missing)
+            yield from self._assemble(self._reorderer.push(found))
 
     def expire(self, now_ns: int) -> Iterator[ReceivedFrame]:
         """The frames that are whole because what is missing before them is given up."""
-        for ordered, missing in self._reorderer.expire(now_ns):
-            yield from self._assemble(ordered, missing)
+        yield from self._assemble(self._reorderer.expire(now_ns))
 
-    def _assemble(self, packet: rtp.Packet, missing: int) -> Iterator[ReceivedFrame]:
-        for unit in self._depacketizer.push(packet, missing):
+    def _assemble(self, ordered: Iterable[tuple[rtp.Packet, int]]) -> Iterator[ReceivedFrame]:
+        units = (unit for each in ordered for unit in self._depacketizer.push(*each))
+        for unit in units:
             self._counters.access_units += 1
             unit = self._decoder.with_sets(unit)
             picture = self._decoder.decode(unit)

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -140,14 +141,15 @@ class ReplaySource(Source):
         self._decoder: RecordingDecoder | None = None
         self._stamps: dict[int, Stamp] = {}
         self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
-        self._pictures = self._taken_pictures()
+        pictures = self._taken_pictures()
         try:
             # The first picture tells its size before anything is sent.
-            self._first = next(self._pictures, None)
-            if self._first is None:
+            first = next(pictures, None)
+            if first is None:
                 raise RecordingError(
                     f"{self._path}: no frames after start_s={self._start_ns / 1e9}"
                 )
+            self._pictures = chain([first], pictures)
             self._caps = self._checked_caps(camera)
         except BaseException:
             self.close()
@@ -182,7 +184,7 @@ class ReplaySource(Source):
         source = self._pipeline.get_by_name("source")
         gst = gstreamer.load()
         try:
-            for picture in self._with_first():
+            for picture in self._pictures:
                 running_ns = self._pace.turn(picture.time_ns)
                 if running_ns is None:
                     break
@@ -213,11 +215,6 @@ class ReplaySource(Source):
 
     def _running_ns(self) -> int:
         return int(self._pipeline.get_clock().get_time() - self._pipeline.get_base_time())
-
-    def _with_first(self) -> Iterator[Picture]:
-        assert self._first is not None
-        yield self._first
-        yield from self._pictures
 
     def _taken_pictures(self) -> Iterator[Picture]:
         """The pictures that the camera takes, round after round, with rising times."""
