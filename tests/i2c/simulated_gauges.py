@@ -48,8 +48,14 @@ class Chip(Protocol):
     def write(self, register: int, value: int) -> None: ...
 
 
-class Ina219Chip:
-    """`voltage` at IN-, V, and `shunt_v` from IN+ to IN- are what it measures."""
+class _InaChip:
+    """What both chips have: `voltage`, V, and `shunt_v` from IN+ to IN- are what they measure."""
+
+    AFTER_RESET: int
+    """The configuration after power-on; which of its bits can be set, which are always."""
+    SETTABLE: int
+    FIXED = 0
+    CALIBRATION_BITS: int
 
     def __init__(self) -> None:
         self.voltage, self.shunt_v = 0.0, 0.0
@@ -57,7 +63,22 @@ class Ina219Chip:
 
     def reset(self) -> None:
         """As after power-on."""
-        self._configuration, self._calibration = 0x399F, 0
+        self._configuration, self._calibration = self.AFTER_RESET, 0
+
+    def write(self, register: int, value: int) -> None:
+        """Sets a register; the others are read-only."""
+        if register == ina.CONFIGURATION and value & ina.RESET:
+            self.reset()
+        elif register == ina.CONFIGURATION:
+            self._configuration = value & self.SETTABLE | self.FIXED
+        elif register == ina.CALIBRATION:
+            self._calibration = value & self.CALIBRATION_BITS
+
+
+class Ina219Chip(_InaChip):
+    """Its `voltage` is at IN-."""
+
+    AFTER_RESET, SETTABLE, CALIBRATION_BITS = 0x399F, 0x3FFF, 0xFFFE
 
     def read(self, register: int) -> int:
         """A register's value."""
@@ -79,26 +100,11 @@ class Ina219Chip:
         }
         return values.get(register, 0) & 0xFFFF
 
-    def write(self, register: int, value: int) -> None:
-        """Sets a register; the others are read-only."""
-        if register == ina.CONFIGURATION and value & ina.RESET:
-            self.reset()
-        elif register == ina.CONFIGURATION:
-            self._configuration = value & 0x3FFF
-        elif register == ina.CALIBRATION:
-            self._calibration = value & 0xFFFE
 
+class Ina226Chip(_InaChip):
+    """Its `voltage` is at VBUS."""
 
-class Ina226Chip:
-    """`voltage` at VBUS, V, and `shunt_v` from IN+ to IN- are what it measures."""
-
-    def __init__(self) -> None:
-        self.voltage, self.shunt_v = 0.0, 0.0
-        self.reset()
-
-    def reset(self) -> None:
-        """As after power-on."""
-        self._configuration, self._calibration = 0x4127, 0
+    AFTER_RESET, SETTABLE, FIXED, CALIBRATION_BITS = 0x4127, 0x0FFF, 0x4000, 0x7FFF
 
     def read(self, register: int) -> int:
         """A register's value."""
@@ -116,15 +122,6 @@ class Ina226Chip:
             ina.DIE_ID: 0x2260,
         }
         return values.get(register, 0) & 0xFFFF
-
-    def write(self, register: int, value: int) -> None:
-        """Sets a register; the others are read-only."""
-        if register == ina.CONFIGURATION and value & ina.RESET:
-            self.reset()
-        elif register == ina.CONFIGURATION:
-            self._configuration = value & 0x0FFF | 0x4000
-        elif register == ina.CALIBRATION:
-            self._calibration = value & 0x7FFF
 
 
 class Max17048Chip:

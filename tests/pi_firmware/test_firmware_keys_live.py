@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import itertools
-import os
-import pty
-import select
 import statistics
 import threading
 import time
-import tty
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import pytest
-from pymavlink.dialects.v20 import common as mavlink
 from tapped import LIMIT_S, Tap, start
+from vehicle import Vehicle
 
 from ground_station.stream import command as commands
 from ground_station.stream.counters import Counters
@@ -26,13 +23,6 @@ from pi_firmware import settings
 from pi_firmware.wire import keys, messages, rtcp, video
 from pi_firmware.wire.telemetry import Session, open_session
 
-KINDS: dict[str, type[messages.Message]] = {
-    keys.BATTERY: messages.Battery,
-    keys.GATE: messages.Gate,
-    keys.EVENT: messages.Event,
-    keys.AUTOPILOT: messages.Autopilot,
-    keys.HEALTH: messages.Health,
-}
 CONFIGURED: dict[str, object] = {
     "payload_id": "keys-7",
     "camera.uri": "test:?hang_at_s=1.5",
@@ -69,33 +59,32 @@ class Heard:
 
     def _take(self, sample: Any) -> None:
         _, payload_id, kind = str(sample.key_expr).split("/")
-        if kind in KINDS:
-            self.said.append((payload_id, messages.decode(KINDS[kind], sample.payload.to_bytes())))
+        if kind in messages.KINDS:
+            self.said.append(
+                (payload_id, messages.decode(messages.KINDS[kind], sample.payload.to_bytes()))
+            )
 
     def of(self, kind: str) -> list[Any]:
-        return [message for _, message in list(self.said) if isinstance(message, KINDS[kind])]
+        return [
+            message for _, message in list(self.said) if isinstance(message, messages.KINDS[kind])
+        ]
 
 
 class Live:
     """The flight: what was asked for, and what everyone around saw."""
 
-    def __init__(self, stack: ExitStack) -> None:
+    def __init__(self, stack: ExitStack, folder: Path) -> None:
         self.tap = stack.enter_context(Tap(str(CONFIGURED["link.host"])))
         self.session = open_session(listen=["tcp/127.0.0.1:0"])
         stack.callback(self.session.close)
         self.heard = Heard(self.session)
-        self.master, slave = pty.openpty()
-        tty.setraw(slave)
-        stack.callback(os.close, self.master)
-        self._coder = mavlink.MAVLink(None)
-        self._coder.robust_parsing = True
-        self.autopilot_heard: list[Any] = []
+        self.vehicle = Vehicle(folder / "tty")
+        stack.callback(self.vehicle.unplug)
         self.asked = CONFIGURED | {
             "link.port": self.tap.port,
-            "autopilot.uri": f"serial:{os.ttyname(slave)}",
+            "autopilot.uri": f"serial:{self.vehicle.link.readlink()}",
             "telemetry.connect": list(self.session.listening),
         }
-        os.close(slave)
         self.answer: messages.Answer | None = None
         self.heard_elsewhere = 0
         self.payload_id = str(self.asked["payload_id"])
@@ -103,11 +92,11 @@ class Live:
 
     def fly(self) -> None:
         """Speaks to the payload until all has been seen that is to be; then ends it."""
-        until = Waiting(self.listen)
+        until = Waiting(self.vehicle.listen)
         try:
             until(lambda: self.has("radio-failed") and self.has("battery-low"))
             until(lambda: self.has("camera-restarted") and self.has("streaming-again"))
-            until(lambda: self.autopilot_heard, lambda: self.put(keys.POSE, pose()))
+            until(self.vehicle.estimates, lambda: self.put(keys.POSE, pose()))
             until(lambda: len(self.lossy()) > 3, lambda: self.put(keys.LINK, self.report()))
             until(lambda: len(self.tap.packets(again=True)) > 3, self.ask_again)
             self.answer = commands.ask(
@@ -138,16 +127,6 @@ class Live:
         lines = [self.process.stdout.readline() for _ in range(2)]
         in_vain.cancel()
         return [lines[1].split()[-1]] if lines[1].startswith("telemetry on ") else []
-
-    def listen(self) -> None:
-        if select.select([self.master], [], [], 0.05)[0]:
-            try:
-                data = os.read(self.master, 4096)
-            except OSError:  # nobody has the other end open
-                time.sleep(0.05)
-                return
-            heard = self._coder.parse_buffer(data) or []
-            self.autopilot_heard += [m for m in heard if m.get_type() == "VISION_POSITION_ESTIMATE"]
 
     def put(self, kind: str, message: messages.Message) -> None:
         self.session.zenoh.put(keys.key(self.payload_id, kind), messages.encode(message))
@@ -194,9 +173,9 @@ def pose() -> messages.Pose:
 
 
 @pytest.fixture(scope="module")
-def live() -> Iterator[Live]:
+def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     with ExitStack() as stack:
-        made = Live(stack)
+        made = Live(stack, tmp_path_factory.mktemp("live"))
         made.fly()
         yield made
 
@@ -293,7 +272,7 @@ def test_no_command_goes_below_the_least_bit_rate(live: Live) -> None:
 def test_the_autopilot_gets_poses_and_says_its_state_so_often(live: Live) -> None:
     """At the far end of the line that autopilot.uri names."""
     assert str(live.asked["autopilot.uri"]).startswith("serial:/dev/")
-    assert live.autopilot_heard[0].z == pytest.approx(-3.0)
+    assert live.vehicle.estimates()[0].z == pytest.approx(-3.0)
     states = live.heard.of(keys.AUTOPILOT)
     assert period_s(states) < 2.5 * float(str(live.asked["autopilot.period_s"]))
 

@@ -87,15 +87,16 @@ class PayloadClock(Step):
     """Its wall clock is set by so many seconds, and set right again."""
 
     by_s: float = 3600.0
+    SIDE: ClassVar[str] = "payload"
 
     def inject(self, world: World) -> None:
-        world.disturb(self, "payload", "stepped_clock", int(1e9 * self.by_s))
+        world.disturb(self, self.SIDE, "stepped_clock", int(1e9 * self.by_s))
 
     def lacking(self, world: World) -> str:
         return "" if world.shims else "no shim sets it"
 
     def fix(self, world: World) -> None:
-        world.disturb(self, "payload", "stepped_clock", 0)
+        world.disturb(self, self.SIDE, "stepped_clock", 0)
 
 
 @dataclass(frozen=True)

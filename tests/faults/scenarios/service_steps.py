@@ -13,6 +13,7 @@ from intake_stand import eventually
 from standing import is_stopped
 
 from scenarios import disk
+from scenarios.payload_steps import PayloadClock
 from scenarios.step import Step
 
 if TYPE_CHECKING:
@@ -125,19 +126,10 @@ class ServiceRestarted(ServiceKilled):
 
 
 @dataclass(frozen=True)
-class GroundClock(Step):
-    """The ground station's wall clock is set by so many seconds, and set right again."""
+class GroundClock(PayloadClock):
+    """The same of the ground station."""
 
-    by_s: float = 3600.0
-
-    def inject(self, world: World) -> None:
-        world.disturb(self, "ground", "stepped_clock", int(1e9 * self.by_s))
-
-    def lacking(self, world: World) -> str:
-        return "" if world.shims else "no shim sets it"
-
-    def fix(self, world: World) -> None:
-        world.disturb(self, "ground", "stepped_clock", 0)
+    SIDE: ClassVar[str] = "ground"
 
 
 @dataclass(frozen=True)
