@@ -5,8 +5,6 @@ Tangent vectors are rotation first, then translation (rad, metres), as in GTSAM'
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
@@ -49,86 +47,27 @@ def transform(aTb: npt.ArrayLike, points_b: npt.ArrayLike) -> F64:
 
 
 def exp(xi: npt.ArrayLike) -> F64:
-    """SE(3) exponential of a tangent vector (6,), rotation first. Barfoot 2017, eq. 7.26.
+    """SE(3) exponential (4, 4) of a tangent vector (6,), rotation first."""
+    import gtsam  # here, and below: four tenths of a second for who has no tangent vectors
 
-    On plain numbers: arrays of three cost several times as much, and trackers call this often.
-    """
-    a, b, c, x, y, z = np.asarray(xi, dtype=np.float64).tolist()
-    square = a * a + b * b + c * c
-    theta = math.sqrt(square)
-    if theta < 1e-2:  # series: the closed forms lose digits here
-        first = 1 - square / 6 * (1 - square / 20)
-        second = 0.5 - square / 24 * (1 - square / 30)
-        third = 1 / 6 - square / 120 * (1 - square / 42)
-    elif theta < math.inf:
-        first = math.sin(theta) / theta
-        second = (1 - math.cos(theta)) / square
-        third = (theta - math.sin(theta)) / (square * theta)
-    else:
-        first = second = third = math.nan
-    # ω × v and ω × (ω × v)
-    d, e, f = b * z - c * y, c * x - a * z, a * y - b * x
-    g, h, i = b * f - c * e, c * d - a * f, a * e - b * d
-    return np.array(
-        [
-            [
-                1 - second * (b * b + c * c),
-                second * a * b - first * c,
-                second * a * c + first * b,
-                x + second * d + third * g,
-            ],
-            [
-                second * a * b + first * c,
-                1 - second * (a * a + c * c),
-                second * b * c - first * a,
-                y + second * e + third * h,
-            ],
-            [
-                second * a * c - first * b,
-                second * b * c + first * a,
-                1 - second * (a * a + b * b),
-                z + second * f + third * i,
-            ],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    motion = gtsam.Pose3.Expmap(np.asarray(xi, dtype=np.float64))
+    return np.ascontiguousarray(motion.matrix())
 
 
 def log(aTb: npt.ArrayLike) -> F64:
-    """The inverse of `exp`: the tangent vector (6,) of one pose (4, 4). Barfoot 2017, eq. 7.35."""
-    T = np.asarray(aTb, dtype=np.float64)
-    (r00, r01, r02, x), (r10, r11, r12, y), (r20, r21, r22, z), _ = T.tolist()
-    # Twice the axis times the angle's sine, and twice its cosine.
-    a, b, c = r21 - r12, r02 - r20, r10 - r01
-    sine, cosine = math.sqrt(a * a + b * b + c * c), r00 + r11 + r22 - 1
-    if not math.isfinite(sine + cosine):
-        return np.full(6, np.nan)
-    theta = math.atan2(sine, cosine)
-    if theta < 3.0:
-        scale = theta / sine if sine > 1e-12 else 0.5
-        a, b, c = a * scale, b * scale, c * scale
-    else:  # near half a turn, where that axis loses digits
-        a, b, c = Rotation.from_matrix(T[:3, :3]).as_rotvec().tolist()
-        theta = math.sqrt(a * a + b * b + c * c)
-    square = theta * theta
-    if theta < 1e-2:
-        second = 1 / 12 + square / 720
-    else:
-        second = (1 - theta / 2 / math.tan(theta / 2)) / square
-    d, e, f = b * z - c * y, c * x - a * z, a * y - b * x
-    g, h, i = b * f - c * e, c * d - a * f, a * e - b * d
-    return np.array(
-        [a, b, c, x - d / 2 + second * g, y - e / 2 + second * h, z - f / 2 + second * i]
-    )
+    """The inverse of `exp`: the tangent vector (6,) of one pose (4, 4)."""
+    import gtsam
+
+    motion = gtsam.Pose3(np.asarray(aTb, dtype=np.float64))
+    return np.asarray(gtsam.Pose3.Logmap(motion))
 
 
 def adjoint(aTb: npt.ArrayLike) -> F64:
     """(6, 6): takes a tangent vector in b to a, rotation first. Barfoot 2017, eq. 7.45."""
-    T = np.asarray(aTb, dtype=np.float64)
-    result = np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = T[:3, :3]
-    result[3:, :3] = np.cross(T[:3, 3], T[:3, :3], axisb=0, axisc=0)
-    return result
+    import gtsam
+
+    motion = gtsam.Pose3(np.asarray(aTb, dtype=np.float64))
+    return np.ascontiguousarray(motion.AdjointMap())
 
 
 def rotation_angle(aRb: npt.ArrayLike) -> F64:

@@ -24,11 +24,7 @@ def constant_velocity(wTc_before: npt.ArrayLike, wTc_last: npt.ArrayLike, fracti
     With equal steps, fraction 1, wT̂(k+1) = wT(k)·wT(k−1)⁻¹·wT(k): the step in the camera's own
     frame is made once more. Other fractions move along the same twist.
     """
-    wTc_last = np.asarray(wTc_last, dtype=np.float64)
-    step = poses.inverse(wTc_before) @ wTc_last
-    if fraction != 1.0:
-        step = poses.exp(fraction * poses.log(step))
-    wTc = wTc_last @ step
+    wTc = poses.interpolate(wTc_before, wTc_last, 1 + fraction)
     # Each product of products doubles the rounding error, and a solver keeps what it starts from:
     # unless it is made a rotation again, some fifty frames later it is none.
     return poses.from_quaternion(wTc[:3, 3], poses.to_quaternion(wTc))

@@ -14,12 +14,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 
 from ground_station.arrays import F64, Bools
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
-from ground_station.localization.row_motion import RowMotion, adjoint
+from ground_station.localization.row_motion import RowMotion
 
 NEAREST_M = 1e-3
 """A point nearer than this, or behind, has no projection."""
@@ -54,7 +55,7 @@ class Prior:
     def at(self, wTc: F64, twist: F64) -> tuple[F64, F64, float]:
         """Information (12, 12), gradient (12,) and cost for steps from a pose and twist."""
         step = self.apart(wTc, twist)
-        ad = adjoint(step[:6])
+        ad = gtsam.Pose3.adjointMap(step[:6])
         J = np.eye(12)
         # Of log(exp(step)·exp(ξ)); Barfoot 2017, eq. 7.82, for the right tangent.
         J[:6, :6] += 0.5 * ad + ad @ ad / 12

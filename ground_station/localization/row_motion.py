@@ -4,24 +4,10 @@ from __future__ import annotations
 
 import math
 
+import gtsam
 import numpy as np
 
 from ground_station.arrays import F64
-
-
-def adjoint(xi: F64) -> F64:
-    """The 6×6 matrix of the Lie bracket [xi, ·] of se(3), rotation first; Barfoot, eq. 7.32."""
-    a, b, c, x, y, z = xi.tolist()
-    return np.array(
-        [
-            [0, -c, b, 0, 0, 0],
-            [c, 0, -a, 0, 0, 0],
-            [-b, a, 0, 0, 0, 0],
-            [0, -z, y, 0, -c, b],
-            [z, 0, -x, c, 0, -a],
-            [-y, x, 0, -b, a, 0],
-        ]
-    )
 
 
 class RowMotion:
@@ -32,7 +18,7 @@ class RowMotion:
     """
 
     def __init__(self, row_s: F64, twist: F64) -> None:
-        self.row_s, self.ad = row_s, adjoint(twist)
+        self.row_s, self.ad = row_s, gtsam.Pose3.adjointMap(twist)
         self.hat = self.ad[:3, :3]
         self.square = self.hat @ self.hat
         rate = math.sqrt(float(twist[:3] @ twist[:3]))
