@@ -12,7 +12,7 @@ from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.localization.kinematics import Kinematics, LandmarkObservations, Solution
-from ground_station.localization.pose_alone import solve_direct, solve_graph
+from ground_station.localization.pose_alone import solve_graph
 from ground_station.localization.pose_rolling import solve_rolling
 from ground_station.localization.settings import LocalizerSettings, MotionSettings, PoseSettings
 from ground_station.localization.smoother import FixedLagSmoother
@@ -71,9 +71,6 @@ class MotionModel:
         return constant_velocity(self._before[1], wTc, ahead_ns / step_ns)
 
 
-_POSE_SOLVERS = {"graph": solve_graph, "direct": solve_direct}
-
-
 class Estimator(Protocol):
     """What the localizer believes about the camera between two frames."""
 
@@ -115,7 +112,6 @@ class PoseEstimator:
 
     def __init__(self, camera: Camera, settings: LocalizerSettings) -> None:
         self._camera = camera
-        self._solve = _POSE_SOLVERS[settings.pose.solver]
         self._motion = MotionModel(settings.motion)
 
     def restart(self, time_ns: int, wTc: F64, covariance: F64 | None = None) -> None:
@@ -131,7 +127,7 @@ class PoseEstimator:
     ) -> Solution:
         if len(observations):
             settings = dataclasses.replace(settings, sigma_px=float(observations.sigma_px.mean()))
-        return self._solve(predicted, observations, self._camera, settings)
+        return solve_graph(predicted, observations, self._camera, settings)
 
     def update(self, solution: Solution, wild: bool = False) -> Kinematics:
         assert solution.state is not None

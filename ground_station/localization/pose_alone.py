@@ -1,5 +1,4 @@
-"""A frame's pose from that frame alone: by the thesis's graph of GTSAM, and the same without
-landmark variables, by vectorised, damped Gauss-Newton on SE(3)."""
+"""A frame's pose from that frame alone, by the thesis's graph of GTSAM."""
 
 from __future__ import annotations
 
@@ -15,20 +14,7 @@ from ground_station.localization.kinematics import (
     Solution,
     no_solution,
 )
-from ground_station.localization.pose_newton import Reprojection, descend
 from ground_station.localization.settings import PoseSettings
-
-
-def _solution(
-    time_ns: int, wTc: F64, covariance: F64, residual_px: F64, inlier_px: float, iterations: int
-) -> Solution:
-    """The solution of a pose (4, 4) with its covariance (6, 6), which knows of no velocity."""
-    full = np.zeros((12, 12))
-    full[:6, :6] = covariance
-    return Solution(
-        Kinematics(time_ns, wTc, np.zeros(6), full), np.zeros((12, 12)), np.zeros(12),
-        residual_px, residual_px < inlier_px, iterations=iterations,
-    )  # fmt: skip
 
 
 def reprojection_px(camera: Camera, wTc: F64, points_w: F64, pinhole_px: F64) -> F64:
@@ -86,44 +72,9 @@ def solve_graph(
     except RuntimeError:  # GTSAM's way of saying that the system is singular
         return no_solution(n, "singular")
     residual = reprojection_px(camera, solved, points_w, pinhole_px)
-    return _solution(guess.time_ns, solved, covariance, residual, settings.inlier_px, iterations)
-
-
-def solve_direct(
-    guess: Kinematics, observations: LandmarkObservations, camera: Camera, settings: PoseSettings
-) -> Solution:
-    """The pose that explains N landmarks seen at undistorted pixels, from a guess of it.
-
-    The optimum of `solve_graph`, each landmark marginalised: see `pose_newton`. With
-    `reject_outliers` it is solved once more from the inliers alone.
-    """
-    count, points_w, pinhole_px = len(observations), observations.points_m, observations.pinhole_px
-    wTc = guess.wTc
-    every = Reprojection(
-        points_m=np.array(points_w.T, np.float64),
-        offset_px=np.array((pinhole_px - [camera.cx_px, camera.cy_px]).T, np.float64),
-        covariance_m2=np.repeat(settings.landmark_sigma_m**2 * np.eye(3)[:, :, None], count, 2),
-        variance_px2=np.full(count, settings.sigma_px**2),
-        row_s=None,
-        camera=camera,
-        huber_k=settings.huber_k,
-        by_focal_m=np.zeros((3, count)),
-    )
-    inlier, iterations, still = np.ones(count, bool), 0, np.zeros(6)
-    with np.errstate(all="ignore"):  # what is not finite is a failure
-        for last in (False, True) if settings.reject_outliers else (True,):
-            if (left := int(inlier.sum())) < settings.min_inliers:
-                return no_solution(count, f"{left} inliers", iterations)
-            chosen = every if left == count else every.where(inlier)
-            found = descend(chosen, wTc, still, None, settings.max_iterations, rough=not last)
-            iterations += found.iterations
-            if found.reason:
-                return no_solution(count, found.reason, iterations)
-            wTc = found.wTc
-            residual = reprojection_px(camera, wTc, points_w, pinhole_px)
-            inlier = residual < settings.inlier_px
-    information = found.linear.information
-    if not np.linalg.cond(information) < 1e14:
-        return no_solution(count, "singular", iterations)
-    covariance = np.asarray(np.linalg.inv(information), np.float64)
-    return _solution(guess.time_ns, wTc, covariance, residual, settings.inlier_px, iterations)
+    full = np.zeros((12, 12))  # of a velocity it knows nothing
+    full[:6, :6] = covariance
+    return Solution(
+        Kinematics(guess.time_ns, solved, np.zeros(6), full), np.zeros((12, 12)), np.zeros(12),
+        residual, residual < settings.inlier_px, iterations=iterations,
+    )  # fmt: skip

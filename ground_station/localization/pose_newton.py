@@ -1,6 +1,6 @@
 """Damped Gauss-Newton on one frame's observations, their landmarks marginalised.
 
-What `solve_direct` and `solve_rolling` share. The objective is that of a graph with a variable for
+What `solve_rolling` descends by. The objective is that of a graph with a variable for
 each landmark: Huber's loss of each whitened pixel residual, and each landmark's Gaussian prior. A
 landmark is eliminated in closed form: with pixel residual r, S its position's covariance seen in
 the image and y = (t·sigma²·I + S)⁻¹ r, its best move leaves the residual t·sigma²·y, where t = 1
@@ -68,12 +68,12 @@ class Linear:
     """The observations' cost near a pose and twist, to second order, and their landmarks' best
     moves.
 
-    `information` (D, D), `gradient` (D,) for steps of pose and twist (D = 12) or of the pose alone
-    (D = 6); `moved_m` (3, N) in the world; `spread_px2` (3, N), the landmarks' covariances in the
+    `information` (12, 12), `gradient` (12,) for steps of pose and twist; `moved_m` (3, N) in the
+    world; `spread_px2` (3, N), the landmarks' covariances in the
     image (uu, uv, vv), and `reach` (2, 3, N) what moves them: their covariance by each coordinate.
     `rows` (2, 3, N) are ∂pixel/∂landmark once these are moved along. `excess` (N,) is the variance,
     px², that reweighting adds beyond Huber's reach. `bent_px` (2, N) is how the landmarks' pixels
-    follow the share by which the map's focal length is longer, and `by_focal` (D, 2) the steps'
+    follow the share by which the map's focal length is longer, and `by_focal` (12, 2) the steps'
     mixed second derivative with that share of the frame's and of the map's.
     """
 
@@ -94,15 +94,15 @@ class Reprojection:
     """The robust reprojection cost of N landmarks in one frame; arrays with N last.
 
     `offset_px` (2, N) is from the principal point to the undistorted pixel of each observation.
-    `row_s` (N,) is None for a global shutter: then the pose is all that is asked for. `by_focal_m`
-    (3, N) is how landmarks follow the map's focal length.
+    `row_s` (N,) is when its row is exposed after the frame's time. `by_focal_m` (3, N) is how
+    landmarks follow the map's focal length.
     """
 
     points_m: F64
     offset_px: F64
     covariance_m2: F64
     variance_px2: F64
-    row_s: F64 | None
+    row_s: F64
     camera: Camera
     huber_k: float
     by_focal_m: F64
@@ -120,17 +120,15 @@ class Reprojection:
             offset_px=self.offset_px[:, keep],
             covariance_m2=self.covariance_m2[:, :, keep],
             variance_px2=self.variance_px2[keep],
-            row_s=None if self.row_s is None else self.row_s[keep],
+            row_s=self.row_s[keep],
             by_focal_m=self.by_focal_m[:, keep],
         )
 
     def view(self, wTc: F64, twist: F64, moved_m: F64 | None = None) -> View:
         """What a pose (4, 4) and twist (6,) have the camera see, landmarks moved by `moved_m`."""
         world = self.points_m if moved_m is None else self.points_m + moved_m
-        points = wTc[:3, :3].T @ (world - wTc[:3, 3:])
-        motion = None if self.row_s is None else RowMotion(self.row_s, twist)
-        if motion is not None:
-            points = motion.forward(points)
+        motion = RowMotion(self.row_s, twist)
+        points = motion.forward(wTc[:3, :3].T @ (world - wTc[:3, 3:]))
         z = points[2]
         front = z > NEAREST_M
         all_front = bool(front.all())
@@ -258,7 +256,7 @@ class View:
 
     camera: Camera
     wRc: F64
-    motion: RowMotion | None
+    motion: RowMotion
     uv: F64
     inverse_z: F64
     residual_px: F64
@@ -273,12 +271,10 @@ class View:
         np.multiply(camera.fy_px, self.inverse_z, out=rows[1, 1])
         np.multiply(-rows[0, 0], u, out=rows[0, 2])
         np.multiply(-rows[1, 1], v, out=rows[1, 2])
-        if self.motion is not None:
-            rows = self.motion.turned_back(rows)
-        return self.wRc @ rows
+        return self.wRc @ self.motion.turned_back(rows)
 
     def jacobian(self) -> F64:
-        """∂pixel/∂(pose, twist) (12, 2, N), or ∂pixel/∂pose (6, 2, N) without a motion.
+        """∂pixel/∂(pose, twist) (12, 2, N).
 
         Right tangent: the pinhole's derivative times ∂p_c/∂ξ = [hat(p_c), −I].
         """
@@ -295,7 +291,7 @@ class View:
         np.multiply(-fy, u, out=J[2, 1])
         np.multiply(-fy, self.inverse_z, out=J[4, 1])
         np.multiply(-J[4, 1], v, out=J[5, 1])
-        return J if self.motion is None else self.motion.jacobian(J)
+        return self.motion.jacobian(J)
 
 
 @dataclass(frozen=True)
@@ -313,7 +309,7 @@ def descend(
     observations: Reprojection,
     wTc: F64,
     twist: F64,
-    prior: Prior | None,
+    prior: Prior,
     max_iterations: int,
     rough: bool = False,
 ) -> Descent:
@@ -342,7 +338,7 @@ def descend(
             return Descent(wTc, twist, linear, iteration, "not finite")
         decrement = -float(step @ gradient)
         candidate = wTc @ poses.exp(step[:6])
-        speed = twist + step[6:] if len(step) > 6 else twist
+        speed = twist + step[6:]
         if damping == 0 and not sharp and decrement < (_ROUGH if rough else _CONVERGED):
             # So short a step changes nothing but the gradient.
             left = linear.gradient + linear.information @ step
@@ -368,8 +364,6 @@ def descend(
     return Descent(wTc, twist, linear, max_iterations, reason)
 
 
-def _with(prior: Prior | None, linear: Linear, wTc: F64, twist: F64) -> tuple[F64, F64, float]:
-    if prior is None:
-        return linear.information, linear.gradient, linear.cost
+def _with(prior: Prior, linear: Linear, wTc: F64, twist: F64) -> tuple[F64, F64, float]:
     information, gradient, cost = prior.at(wTc, twist)
     return information + linear.information, gradient + linear.gradient, cost + linear.cost

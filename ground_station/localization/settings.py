@@ -75,7 +75,7 @@ class AssociationSettings:
 class PoseSettings:
     """How a pose is solved from its observations, and when it is believed."""
 
-    solver: str = config.key("graph", choices=["graph", "direct", "rolling"])
+    solver: str = config.key("graph", choices=["graph", "rolling"])
     sigma_px: float = config.key(5.0, unit="px", low=0.1, high=50)
     huber_k: float = config.key(1.345, low=0.1, high=100)
     landmark_sigma_m: float = config.key(0.01, unit="m", low=1e-6, high=10)

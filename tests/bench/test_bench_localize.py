@@ -35,11 +35,6 @@ def test_association_is_compared_with_a_loop_that_has_the_same_pairs(run):
     assert row["same"] and row["pairs"] > 900 and row["ratio"] > 0
 
 
-def test_the_direct_pose_is_compared_with_a_graph_of_the_same_optimum(run):
-    row = run[1]["pose"]
-    assert row["apart_m"] < 1e-4 and row["ratio"] > 0
-
-
 def test_a_larger_map_shows_no_more_of_itself(run):
     small, large, dense = run[1]["growth"]
     assert (small["landmarks"], large["landmarks"]) == (10_000, 200_000)

@@ -13,7 +13,6 @@ from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA as CAMERA
 from ground_station.localization import pose_rolling
 from ground_station.localization.kinematics import Kinematics, LandmarkObservations, Solution
-from ground_station.localization.pose_alone import solve_direct
 from ground_station.localization.pose_newton import Prior, Reprojection
 from ground_station.localization.pose_rolling import solve_rolling
 from ground_station.localization.settings import PoseSettings
@@ -262,25 +261,6 @@ def test_a_global_shutter_leaves_the_velocity_as_predicted():
     assert np.allclose(solution.state.twist, predicted.twist, atol=1e-12)
     assert np.allclose(solution.state.covariance[6:, 6:], predicted.covariance[6:, 6:])
     assert not solution.information[6:].any() and not solution.gradient[6:].any()
-
-
-def test_with_nothing_predicted_it_is_the_direct_pose():
-    rng = np.random.default_rng(6)
-    predicted, observations, _ = _scene(rng, twist=np.zeros(6), outliers=0.2)
-    observations = dataclasses.replace(
-        observations,
-        row_s=np.zeros(len(observations)),
-        covariance_m2=np.tile(1e-4 * np.eye(3), (len(observations), 1, 1)),
-    )
-    diffuse = np.diag(np.r_[np.full(6, 1e8), np.full(6, 1.0)])
-    settings = dataclasses.replace(SETTINGS, sigma_px=1.0, reject_outliers=False)
-    unknown = dataclasses.replace(predicted, covariance=diffuse)
-    rolling = solve_rolling(unknown, observations, CAMERA, settings)
-    direct = solve_direct(predicted, observations, CAMERA, settings)
-    assert np.abs(rolling.state.wTc - direct.state.wTc).max() < 1e-5
-    assert np.allclose(
-        rolling.state.covariance[:6, :6], direct.state.covariance[:6, :6], rtol=1e-3, atol=1e-9
-    )
 
 
 def test_two_observations_do_beside_a_prediction():
