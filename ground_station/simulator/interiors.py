@@ -19,7 +19,7 @@ from ground_station.simulator.scene import Footprint, Scene, SimulatorError, Sur
 Rng = np.random.Generator
 
 
-class _Room:
+class _Room(SceneBuilder):
     """A box of random size, cut into bays; every wall, window and thing in it random."""
 
     WALLS: tuple[str, ...] = ("plaster", "plaster", "brick", "concrete", "wood")
@@ -32,7 +32,8 @@ class _Room:
     """Detail of the hedges, which are seen from afar."""
 
     def __init__(self, rng: Rng, texels_per_m: float) -> None:
-        self.rng, self.b = rng, SceneBuilder(texels_per_m)
+        super().__init__(texels_per_m)
+        self.rng = rng
         self.size = self._size()
         self.bay = float(rng.uniform(1.6, 3.6))
         self.colours = [self._colour() for _ in range(5)]
@@ -57,16 +58,16 @@ class _Room:
         options: dict[str, Any] = {"slab_m": float(self.rng.uniform(0.3, 1.2))}
         for x, w in _pieces(length, step):
             for y, h in _pieces(width, step):
-                self.b.rectangle([x, y, 0], [w, 0, 0], [0, h, 0], floor, rgb=rgb, **options)
+                self.rectangle([x, y, 0], [w, 0, 0], [0, h, 0], floor, rgb=rgb, **options)
                 if self.rng.random() < 0.12:  # a rooflight
                     continue
-                self.b.rectangle([x, y + h, height], [w, 0, 0], [0, -h, 0], self.ABOVE,
-                                 rgb=self._rgb(), tie_m=0.8, detail=0.6)  # fmt: skip
+                self.rectangle([x, y + h, height], [w, 0, 0], [0, -h, 0], self.ABOVE,
+                               rgb=self._rgb(), tie_m=0.8, detail=0.6)  # fmt: skip
             if self.rng.random() < 0.6:
-                self.b.box([x - 0.1, 0, height - 0.3], [x + 0.1, width, height], "wood",
-                           faces=("-x", "+x", "-z"), detail=0.6)  # fmt: skip
+                self.box([x - 0.1, 0, height - 0.3], [x + 0.1, width, height], "wood",
+                         faces=("-x", "+x", "-z"), detail=0.6)  # fmt: skip
 
-    def walls(self) -> None:
+    def sides(self) -> None:
         """Four walls in bays: blank, with a window, a door or signs."""
         length, width, _ = self.size
         corners = ((0, 0, length), (length, 0, width), (length, width, length), (0, width, width))
@@ -85,7 +86,7 @@ class _Room:
 
         def panel(left: float, low: float, w: float, h: float, material: str, **o: Any) -> Surface:
             place = origin + u * left + up * low + inward * float(o.pop("off", 0.0))
-            return self.b.rectangle(place, u * w, up * h, material, **o)
+            return self.rectangle(place, u * w, up * h, material, **o)
 
         draw = self.rng.random()
         if glazed and draw < 0.75 and wide > 1.2:
@@ -134,23 +135,23 @@ class _Room:
             high = low + float(self.rng.uniform(0.1, 1.7))
             material = str(self.rng.choice(self.SOLIDS))
             faces = (*OPEN, "-z") if low > 0 else OPEN
-            self.b.box([x, y, low], [x + w, y + d, high], material, faces=faces, rgb=self._rgb())
+            self.box([x, y, low], [x + w, y + d, high], material, faces=faces, rgb=self._rgb())
             if w > 0.5 and self.rng.random() < 0.4:
-                self.b.rectangle([x + 0.05, y + 0.05, high + 0.003], [w - 0.1, 0, 0],
-                                 [0, max(0.1, d - 0.1), 0], "poster",
-                                 text=self._word())  # fmt: skip
+                self.rectangle([x + 0.05, y + 0.05, high + 0.003], [w - 0.1, 0, 0],
+                               [0, max(0.1, d - 0.1), 0], "poster",
+                               text=self._word())  # fmt: skip
         for _ in range(int(self.rng.integers(0, 6))):
             centre = (float(self.rng.uniform(1, length - 1)), float(self.rng.uniform(1, width - 1)))
-            self.b.prism(centre, float(self.rng.uniform(0.12, 0.4)), (0, height),
-                         int(self.rng.integers(4, 12)), "concrete", rgb=self._rgb(),
-                         band=(1.1, 1.4, self._rgb()))  # fmt: skip
+            self.prism(centre, float(self.rng.uniform(0.12, 0.4)), (0, height),
+                       int(self.rng.integers(4, 12)), "concrete", rgb=self._rgb(),
+                       band=(1.1, 1.4, self._rgb()))  # fmt: skip
 
     def outside(self) -> None:
         """Sky, hedges and ground beyond the windows, on all sides."""
         length, width, height = self.size
         far = 8.0
-        self.b.rectangle([-far, -far, -0.02], [length + 2 * far, 0, 0], [0, width + 2 * far, 0],
-                         "concrete", detail=0.15, outside=True)  # fmt: skip
+        self.rectangle([-far, -far, -0.02], [length + 2 * far, 0, 0], [0, width + 2 * far, 0],
+                       "concrete", detail=0.15, outside=True)  # fmt: skip
         sides = (
             ([length + far, -far, 0], [-length - 2 * far, 0, 0]),
             ([length + far, width + far, 0], [0, -width - 2 * far, 0]),
@@ -158,12 +159,12 @@ class _Room:
             ([-far, -far, 0], [0, width + 2 * far, 0]),
         )
         for origin, u in sides:
-            self.b.rectangle(origin, u, [0, 0, 14], "sky", detail=0.25, outside=True)
+            self.rectangle(origin, u, [0, 0, 14], "sky", detail=0.25, outside=True)
             near = 0.98 * np.asarray(origin) + 0.02 * np.array([length / 2, width / 2, 0])
-            self.b.rectangle(near, 0.98 * np.asarray(u), [0, 0, float(self.rng.uniform(2, 5))],
-                             "foliage", detail=self.OUTSIDE, zoom=1.2, outside=True)  # fmt: skip
-        self.b.rectangle([-far, width + far, height + 6], [length + 2 * far, 0, 0],
-                         [0, -width - 2 * far, 0], "sky", detail=0.2, outside=True)  # fmt: skip
+            self.rectangle(near, 0.98 * np.asarray(u), [0, 0, float(self.rng.uniform(2, 5))],
+                           "foliage", detail=self.OUTSIDE, zoom=1.2, outside=True)  # fmt: skip
+        self.rectangle([-far, width + far, height + 6], [length + 2 * far, 0, 0],
+                       [0, -width - 2 * far, 0], "sky", detail=0.2, outside=True)  # fmt: skip
 
 
 def _pieces(length: float, step: float) -> list[tuple[float, float]]:
@@ -219,7 +220,7 @@ class _Interior(_Room):
 
     def _survey(self, surface: Surface) -> None:
         for corner, end in ((0, "a"), (2, "b")):
-            self.b.survey(f"{surface.material}-{len(self.b.known)}-{end}", surface, corner)
+            self.survey(f"{surface.material}-{len(self.known)}-{end}", surface, corner)
 
     def things(self) -> None:
         """Furniture along the walls and in the middle; the way round stays free."""
@@ -243,8 +244,8 @@ class _Interior(_Room):
         """A piece of furniture about a place, of a random height."""
         top = float(self.rng.uniform(*high_m))
         material = str(self.rng.choice(self.SOLIDS))
-        self.b.stand((x - w / 2, y - d / 2, 0.0), (x + w / 2, y + d / 2, top), material,
-                     faces=OPEN, rgb=self._rgb())  # fmt: skip
+        self.stand((x - w / 2, y - d / 2, 0.0), (x + w / 2, y + d / 2, top), material,
+                   faces=OPEN, rgb=self._rgb())  # fmt: skip
 
 
 class _Office(_Interior):
@@ -259,7 +260,7 @@ class _Hall(_Interior):
         length, width, height = self.size
         for side in (-0.4, 0.4):
             x = length / 2 + side * (self.ring[0] - _FREE_M)
-            self.b.prism((x, width / 2), 0.25, (0, height), 8, "tiles", rgb=self._rgb())
+            self.prism((x, width / 2), 0.25, (0, height), 8, "tiles", rgb=self._rgb())
 
 
 class _Passage(_Interior):
@@ -310,27 +311,24 @@ class _Stairwell(_Interior):
             x = _STAIR_M + k * run if way > 0 else length - _STAIR_M - (k + 1) * run
             top = low + (k + 1) * (high - low) / count
             # The same plate for all steps, as one maker delivers them.
-            self.b.box([x, y, max(top - 0.3, 0.0)], [x + run, y + _STAIR_M, top], material,
-                       faces=("+z", front, side, "-z"), rgb=rgb, print=2 * _PLATES)  # fmt: skip
-        self.b.footprints.append(
-            Footprint((_STAIR_M, y, length - _STAIR_M, y + _STAIR_M), "stairs")
-        )
+            self.box([x, y, max(top - 0.3, 0.0)], [x + run, y + _STAIR_M, top], material,
+                     faces=("+z", front, side, "-z"), rgb=rgb, print=2 * _PLATES)  # fmt: skip
+        self.footprints.append(Footprint((_STAIR_M, y, length - _STAIR_M, y + _STAIR_M), "stairs"))
 
     def _gallery(
         self, low: tuple[float, float], high: tuple[float, float], top: float, deep: float
     ) -> None:
         """A slab across the well's end, and the railing on its inner edge."""
         material, rgb = self._of
-        self.b.box([*low, top - 0.2], [*high, top], material, faces=("-x", "+x", "-z", "+z"),
-                   rgb=rgb)  # fmt: skip
+        self.box([*low, top - 0.2], [*high, top], material, faces=("-x", "+x", "-z", "+z"), rgb=rgb)
         inner = low[0] if low[0] > 0 else high[0] - 0.05
         y = self.size[1] / 2 - deep / 2
         for k in range(_POSTS):
             at = y + (k + 0.5) * deep / _POSTS
-            self.b.box([inner, at - 0.02, top], [inner + 0.05, at + 0.02, top + 1.0], "metal",
-                       rgb=rgb, print=3 * _PLATES)  # fmt: skip
-        self.b.box([inner, y, top + 1.0], [inner + 0.05, y + deep, top + 1.06], "wood", rgb=rgb)
-        self.b.footprints.append(Footprint((*low, *high), "balcony"))
+            self.box([inner, at - 0.02, top], [inner + 0.05, at + 0.02, top + 1.0], "metal",
+                     rgb=rgb, print=3 * _PLATES)  # fmt: skip
+        self.box([inner, y, top + 1.0], [inner + 0.05, y + deep, top + 1.06], "wood", rgb=rgb)
+        self.footprints.append(Footprint((*low, *high), "balcony"))
 
 
 _FREE_M = 0.9
@@ -359,12 +357,12 @@ def build_room(seed: int, number: int, texels_per_m: float = 80.0) -> Scene:
 
 
 def _built(room: _Room, name: str, **more: Any) -> Scene:
-    for part in (room.floor_and_ceiling, room.walls, room.things, room.outside):
+    for part in (room.floor_and_ceiling, room.sides, room.things, room.outside):
         part()
     length, width, height = room.size
-    room.b.lamps = [
+    room.lamps = [
         (x + w / 2, y + h / 2, height - 0.4)
         for x, w in _pieces(length, 3.5)
         for y, h in _pieces(width, 3.5)
     ]
-    return room.b.scene(name, room.size, int(room.rng.integers(2**31)), **more)
+    return room.scene(name, room.size, int(room.rng.integers(2**31)), **more)
