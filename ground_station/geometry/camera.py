@@ -25,6 +25,9 @@ from ground_station.geometry.lens_models import MODELS, KannalaBrandt, LensModel
 from pi_firmware.wire import config
 from pi_firmware.wire.errors import ConfigError
 
+NEAREST_M = 0.05
+"""Nearer than this a landmark has no useful projection."""
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -82,6 +85,27 @@ class Camera:
         """The lens model with its numbers."""
         chosen = MODELS[self.model]
         return chosen(**{name: getattr(self, name) for name in chosen.NAMES})
+
+    @cached_property
+    def max_radius(self) -> float:
+        """How far from the axis, on the plane z = 1, directions may land in the image.
+
+        Farther out a distortion polynomial folds back, and directions that no pixel sees would land
+        inside. Of a fisheye it is what is used.
+        """
+        w, h = self.width_px - 0.5, self.height_px - 0.5
+        corners = np.array([[-0.5, -0.5], [w, -0.5], [-0.5, h], [w, h]])
+        farthest = 1.02 * float(np.linalg.norm(self.undistort(corners), axis=1).max())
+        reach = self.lens.reach
+        return farthest if farthest < reach else reach  # also where that is not a number
+
+    def inside(self, normalized: F64) -> Bools:
+        """Whether directions (N, 2) on the plane z = 1 land in the image; (N,)."""
+        near = np.einsum("ij,ij->i", normalized, normalized) <= self.max_radius**2
+        pixels = self.distort(normalized[near])
+        last = [self.width_px - 0.5, self.height_px - 0.5]
+        near[near] = ((pixels >= -0.5) & (pixels < last)).all(axis=1)
+        return np.asarray(near)
 
     @property
     def matrix(self) -> F64:

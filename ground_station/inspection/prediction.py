@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 from ground_station.arrays import F64, I64, Bools
 from ground_station.geometry import poses
-from ground_station.geometry.camera import Camera
-from ground_station.geometry.lens import NEAREST_M, Lens
+from ground_station.geometry.camera import NEAREST_M, Camera
 from ground_station.map.store import Map
 
 ANGLE_RAD = np.deg2rad(25.0)
@@ -37,7 +36,6 @@ class View:
 
     def __init__(self, camera: Camera, nearest: float = NEAREST_M) -> None:
         self.camera, self._nearest = camera, nearest
-        self._lens = Lens(camera)
 
     @classmethod
     def of(cls, map_: Map) -> View:
@@ -50,7 +48,7 @@ class View:
         points = points_c.reshape(-1, 3)
         keep = points[:, 2] > self._nearest
         front = points[keep]
-        keep[keep] = self._lens.inside(front[:, :2] / front[:, 2:])
+        keep[keep] = self.camera.inside(front[:, :2] / front[:, 2:])
         return keep.reshape(shape)
 
 

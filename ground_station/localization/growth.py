@@ -23,7 +23,6 @@ from ground_station.errors import GroundStationError
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
-from ground_station.geometry.lens import Lens
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import LocalizerSettings, load_preset
 from ground_station.localization.visibility import LandmarkIndex, project
@@ -122,13 +121,13 @@ def _looking_at_all(
     landmarks: Landmarks, views: list[_View], settings: LocalizerSettings
 ) -> dict[str, float]:
     """The projection of every landmark, and of those that the index gives, by themselves."""
-    lens, index = Lens(THESIS_CAMERA), LandmarkIndex(landmarks)
+    camera, index = THESIS_CAMERA, LandmarkIndex(landmarks)
     spans = np.empty((len(views), 2))
     for span, view in zip(spans, views, strict=True):
         for k in range(2):
             begin = time.perf_counter()
-            among = index.near(view.guess, lens, settings.projection) if k else None
-            project(landmarks, view.guess, lens, settings.projection, among)
+            among = index.near(view.guess, camera, settings.projection) if k else None
+            project(landmarks, view.guess, camera, settings.projection, among)
             span[k] = 1e3 * (time.perf_counter() - begin)
     every, indexed = np.median(spans, axis=0)
     return {"project_all_ms": float(every), "project_indexed_ms": float(indexed)}
@@ -147,7 +146,7 @@ def _view(rng: np.random.Generator, landmarks: Landmarks, settings: LocalizerSet
     R = np.stack([np.cross(z, [0, 0, 1.0]), [0, 0, -1.0], z], axis=1)
     wTc = poses.pose(R, [*rng.uniform(-1, 1, 2), 1.5])
     camera = THESIS_CAMERA
-    seen = project(landmarks, wTc, Lens(camera), settings.projection)
+    seen = project(landmarks, wTc, camera, settings.projection)
     mine = rng.permutation(seen.landmark)[: _FEATURES // 2]
     points = poses.transform(poses.inverse(wTc), landmarks.position_m[mine])
     pixel = rng.uniform(0, [camera.width_px - 1, camera.height_px - 1], (_FEATURES, 2))

@@ -12,7 +12,6 @@ from ground_station.arrays import F32, F64, Bools, Indices
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
-from ground_station.geometry.lens import Lens
 from ground_station.localization.association import Associations, associate
 from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.blur import blurred_sigma_px, expected_blur_px
@@ -108,7 +107,6 @@ class Matcher:
         self.landmarks, self.camera, self.settings = map_.landmarks, camera, settings
         self._modes = map_.modes
         landmarks, keyframes = map_.landmarks, map_.keyframes
-        self._lens = Lens(camera)
         self._depth_m = map_.depth_m
         self._index = LandmarkIndex(landmarks)
         self._covisibility = (
@@ -135,10 +133,10 @@ class Matcher:
         is asked instead of the settings'.
         """
         settings, landmarks = self.settings, self.landmarks
-        among = self._index.near(expected.wTc, self._lens, settings.projection)
+        among = self._index.near(expected.wTc, self.camera, settings.projection)
         if self._covisibility is not None and seen.taken.recent is not None:
             among = self._covisibility.covisible(seen.taken.recent, expected.wTc, among)
-        projected = project(landmarks, expected.wTc, self._lens, settings.projection, among)
+        projected = project(landmarks, expected.wTc, self.camera, settings.projection, among)
         where = projected.pinhole_px
         radius: float | F64 = radius_px or self.radius_px
         if self.camera.model == "fisheye":  # or an array of ones would cost the others time
@@ -219,10 +217,10 @@ class Matcher:
         return [witness.count(each, self.landmarks, among) for each in wTc]
 
     def _witness(self, seen: Described) -> Witness:
-        return Witness(seen.features, self._lens, self._modes, self.scale)
+        return Witness(seen.features, self.camera, self._modes, self.scale)
 
     def _among(self, wTc: F64, nearer_than: float) -> Indices:
-        among = self._index.near(wTc, self._lens, self.settings.projection)
+        among = self._index.near(wTc, self.camera, self.settings.projection)
         return among if nearer_than == np.inf else among[self.depth(wTc, among) < nearer_than]
 
     def depth(self, wTc: F64, landmark: Indices) -> F64:

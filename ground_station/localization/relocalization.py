@@ -15,7 +15,6 @@ import numpy.typing as npt
 from ground_station.arrays import F32, F64, Indices
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
-from ground_station.geometry.lens import Lens
 from ground_station.localization.matching import Described, pixel_jacobian
 from ground_station.localization.retrieval import PlaceIndex
 from ground_station.localization.settings import RecoverySettings
@@ -156,12 +155,12 @@ class _Search:
     """One frame in search of its pose."""
 
     def __init__(
-        self, seen: Described, map_: Map, lens: Lens, settings: RecoverySettings, seed: int,
+        self, seen: Described, map_: Map, camera: Camera, settings: RecoverySettings, seed: int,
         scale: float,
     ) -> None:  # fmt: skip
-        self.seen, self.camera, self.settings, self.seed = seen, lens.camera, settings, seed
+        self.seen, self.camera, self.settings, self.seed = seen, camera, settings, seed
         self.landmarks, self.modes = map_.landmarks, map_.modes
-        self.witness = Witness(seen.features, lens, map_.modes, scale)
+        self.witness = Witness(seen.features, camera, map_.modes, scale)
 
     def propose(self, candidates: Indices) -> tuple[F64, Indices] | str:
         """wTc and its inliers from matches with some landmarks (M,), or why there is none."""
@@ -248,7 +247,7 @@ class Relocalizer:
         """`scale` of the descriptors' distances, over RootSIFT's."""
         self._map, self._scale = map_, scale
         self._same_m = _SAME * map_.depth_m
-        self._lens, self._settings, self._seed = Lens(camera), settings, seed
+        self._camera, self._settings, self._seed = camera, settings, seed
         self._index: PlaceIndex | None = None
         if len(map_.keyframes):
             self._index = PlaceIndex(map_.landmarks, map_.keyframes, seed, map_.modes)
@@ -264,7 +263,7 @@ class Relocalizer:
         """
         if not len(seen):
             return "no features"
-        search = _Search(seen, self._map, self._lens, self._settings, self._seed, self._scale)
+        search = _Search(seen, self._map, self._camera, self._settings, self._seed, self._scale)
         if self._index is None:
             return _only_place(search)
         ranked = self._index.ranked(seen.features.descriptors, _RETRIEVED)
@@ -289,7 +288,7 @@ class Relocalizer:
         if not sure:
             return f"{found[0].doubt} in the most alike places"
         best = _undisputed(sure, self._same_m)
-        held = not self._lens.camera.readout_s  # all rows at once: what is open is known
+        held = not self._camera.readout_s  # all rows at once: what is open is known
         if isinstance(best, str) or held or best.open_by <= _MAX_SIGMA:
             return best
         return f"the inliers leave the position open by {best.open_by:.1%} of their depth"

@@ -10,7 +10,6 @@ from scipy.spatial import cKDTree
 from ground_station.arrays import F32, F64, Indices
 from ground_station.features.extractor import Features
 from ground_station.geometry.camera import Camera
-from ground_station.geometry.lens import Lens
 from ground_station.localization.settings import WIDTH_PX, ProjectionSettings
 from ground_station.localization.visibility import project
 from ground_station.map.modes import Modes, described
@@ -64,11 +63,11 @@ class Witness:
     """A frame's features as a place to look landmarks up in."""
 
     def __init__(
-        self, features: Features, lens: Lens, modes: Modes | None = None, scale: float = 1.0
+        self, features: Features, camera: Camera, modes: Modes | None = None, scale: float = 1.0
     ) -> None:
         """`modes` of the map's landmarks; `scale` of descriptor distances, over RootSIFT's."""
-        self.features, self.lens, self._modes = features, lens, modes
-        self._radius_px = near_px(lens.camera)
+        self.features, self.camera, self._modes = features, camera, modes
+        self._radius_px = near_px(camera)
         self._farthest = min(_MAX_DISTANCE * scale, max(_MAX_DISTANCE, APART))
         self._tree = cKDTree(features.keypoints_px)
 
@@ -100,8 +99,8 @@ class Witness:
 
     def _seen(self, wTc: F64, landmarks: Landmarks, index: Indices) -> tuple[Indices, F64]:
         """Those of the landmarks `index` (M,) that a pose (4, 4) should see, and their pixels."""
-        seen = project(landmarks, wTc, self.lens, _CONES, index)
-        return seen.landmark, self.lens.camera.distort(seen.normalized)
+        seen = project(landmarks, wTc, self.camera, _CONES, index)
+        return seen.landmark, self.camera.distort(seen.normalized)
 
     def _near(self, pixel_px: F64, descriptors: F32, mode: Indices | None) -> tuple[Indices, F64]:
         """For each pixel (N, 2) the nearby feature of nearest descriptor: index, distance (inf).

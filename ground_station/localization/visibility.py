@@ -14,7 +14,7 @@ from scipy import sparse
 
 from ground_station.arrays import F32, F64, I64, Bools, Indices
 from ground_station.geometry import poses
-from ground_station.geometry.lens import NEAREST_M, Lens
+from ground_station.geometry.camera import NEAREST_M, Camera
 from ground_station.localization.settings import ProjectionSettings
 from ground_station.map.store import Keyframes, Landmarks
 
@@ -32,7 +32,7 @@ class Projected:
 def project(
     landmarks: Landmarks,
     wTc: npt.ArrayLike,
-    lens: Lens,
+    camera: Camera,
     settings: ProjectionSettings,
     among: Indices | None = None,
 ) -> Projected:
@@ -49,12 +49,11 @@ def project(
     points = points[front]
     index = front if among is None else among[front]
     normalized = points[:, :2] / points[:, 2:]
-    keep = lens.inside(normalized)
+    keep = camera.inside(normalized)
     index, normalized = index[keep], normalized[keep]
     if settings.viewing_cone and len(index):
         keep = _in_cone(landmarks, index, np.asarray(wTc)[:3, 3], settings)
         index, normalized = index[keep], normalized[keep]
-    camera = lens.camera
     pixels = normalized * [camera.fx_px, camera.fy_px] + [camera.cx_px, camera.cy_px]
     return Projected(index, normalized, pixels)
 
@@ -120,12 +119,12 @@ class LandmarkIndex:
         # Where each block's cells begin among all cells.
         self._block_cells = np.searchsorted(self._cells.starts, self._blocks.starts)
 
-    def near(self, wTc: npt.ArrayLike, lens: Lens, settings: ProjectionSettings) -> Indices:
+    def near(self, wTc: npt.ArrayLike, camera: Camera, settings: ProjectionSettings) -> Indices:
         """Every landmark that `project` could keep from `wTc` (4, 4), and few others; sorted."""
         cTw = poses.inverse(wTc)
-        blocks = _in_view(self._blocks, slice(None), cTw, lens, settings)
+        blocks = _in_view(self._blocks, slice(None), cTw, camera, settings)
         cells = _ranges(self._block_cells[blocks], self._block_cells[blocks + 1])
-        cells = cells[_in_view(self._cells, cells, cTw, lens, settings)]
+        cells = cells[_in_view(self._cells, cells, cTw, camera, settings)]
         rows = _ranges(self._cells.starts[cells], self._cells.starts[cells + 1])
         return np.sort(self._order[rows])
 
@@ -188,7 +187,11 @@ def _bound(position_m: F64, farthest_m: F32, group: I64) -> _Spheres:
 
 
 def _in_view(
-    spheres: _Spheres, which: slice | Indices, cTw: F64, lens: Lens, settings: ProjectionSettings
+    spheres: _Spheres,
+    which: slice | Indices,
+    cTw: F64,
+    camera: Camera,
+    settings: ProjectionSettings,
 ) -> Indices:
     """Of the spheres `which`, the indices of those that reach into the cone around the image.
 
@@ -197,7 +200,7 @@ def _in_view(
     """
     centre = spheres.centre_m[which] @ cTw[:3, :3].T + cTw[:3, 3]
     reach = spheres.radius_m[which] + _SLACK_M
-    half = np.arctan(lens.max_radius)
+    half = np.arctan(camera.max_radius)
     aside = np.hypot(centre[:, 0], centre[:, 1])
     keep = aside * np.cos(half) - centre[:, 2] * np.sin(half) <= reach
     keep &= centre[:, 2] + reach > NEAREST_M

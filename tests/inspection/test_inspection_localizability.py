@@ -12,7 +12,6 @@ from rooms_map import SIDE_M, looking, made_of, two_rooms, wall
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
-from ground_station.geometry.lens import Lens
 from ground_station.inspection.localizability import localizability
 from ground_station.inspection.prediction import MOST, NEEDED, SIGMA_PX, Predictor, View, Visibility
 from ground_station.localization.settings import load_preset
@@ -35,7 +34,7 @@ def test_what_the_localizer_needs_is_what_its_preset_says():
 def test_the_image_ends_where_the_localizer_says():
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-3, 3, (5000, 2)), np.ones(5000)])
-    mine, its = View(THESIS_CAMERA).inside(points), Lens(THESIS_CAMERA).inside(points[:, :2])
+    mine, its = View(THESIS_CAMERA).inside(points), THESIS_CAMERA.inside(points[:, :2])
     assert 100 < its.sum() < 4000 and np.array_equal(mine, its)
     assert not View(THESIS_CAMERA).inside(points * [1, 1, -1]).any()
 

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from ground_station.experiments.alter import scaled_camera
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
-from ground_station.geometry.lens import Lens
 from ground_station.localization.association import associate
 from ground_station.localization.estimate import State
 from ground_station.localization.localizer import Localizer
@@ -204,10 +203,9 @@ def test_modes_that_nothing_looks_like_change_no_pose(room, extractor):
 def test_a_pose_is_as_significant_by_modes(room):
     both, dark = _other_light(room)
     _, truth = room.path(1)
-    lens = Lens(room.camera)
 
     def support(features: Features, modes):
-        witness = Witness(features, lens, modes)
+        witness = Witness(features, room.camera, modes)
         index = np.arange(len(room.map.landmarks))
         return witness.support(truth[0], room.map.landmarks, index)
 
@@ -238,7 +236,7 @@ def test_chance_finds_as_much_in_a_smaller_picture(room):
             descriptors=alike[: len(seen)],
         )
         index = np.arange(len(landmarks))
-        found.append(Witness(features, Lens(camera)).support(truth[0], landmarks, index))
+        found.append(Witness(features, camera).support(truth[0], landmarks, index))
     large, little = found
     assert little.expected == pytest.approx(large.expected, rel=0.05)
     assert large.chance > 0.02 and little.chance == pytest.approx(large.chance, rel=0.2)

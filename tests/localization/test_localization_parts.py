@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from ground_station.geometry import poses
-from ground_station.geometry.lens import Lens
 from ground_station.localization.estimator import MotionModel, constant_velocity
 from ground_station.localization.settings import (
     LocalizerSettings,
@@ -76,7 +75,7 @@ def test_steps_too_far_apart_give_no_velocity():
 def test_projection_agrees_with_gtsam_and_opencv(room):
     _, path = room.path(1)
     camera, wTc = room.camera, path[0]
-    seen = project(room.map.landmarks, wTc, Lens(camera), ProjectionSettings())
+    seen = project(room.map.landmarks, wTc, camera, ProjectionSettings())
     assert len(seen.landmark) > 100
     K = gtsam.Cal3_S2(camera.fx_px, camera.fy_px, 0, camera.cx_px, camera.cy_px)
     pinhole = gtsam.PinholeCameraCal3_S2(gtsam.Pose3(wTc), K)
@@ -96,19 +95,19 @@ def test_projection_agrees_with_gtsam_and_opencv(room):
     # What OpenCV puts inside and we drop lies past the lens's fold, outside of any real image.
     normalized = (points @ cTw[:3, :3].T + cTw[:3, 3])[inside & ~kept]
     radius = np.linalg.norm(normalized[:, :2] / normalized[:, 2:], axis=1)
-    assert (radius > Lens(camera).max_radius).all()
+    assert (radius > camera.max_radius).all()
 
 
 def test_landmarks_looked_at_from_outside_their_cones_are_dropped(room):
     wTc = room.path(1)[1][0]
-    lens, landmarks = Lens(room.camera), room.map.landmarks
+    camera, landmarks = room.camera, room.map.landmarks
     landmarks.view_cos[:] = np.cos(np.deg2rad(10.0))
     turned = landmarks.view_direction + room.rng.normal(0, 0.3, (len(landmarks), 3))
     turned /= np.linalg.norm(turned, axis=1, keepdims=True)
     landmarks.view_direction[:] = turned
-    everything = project(landmarks, wTc, lens, ProjectionSettings())
+    everything = project(landmarks, wTc, camera, ProjectionSettings())
     cone = ProjectionSettings(viewing_cone=True, cone_margin_deg=10, max_distance_ratio=100)
-    seen = project(landmarks, wTc, lens, cone)
+    seen = project(landmarks, wTc, camera, cone)
     rays = wTc[:3, 3] - landmarks.position_m
     cosine = np.einsum("ij,ij->i", rays, landmarks.view_direction)
     cosine /= np.linalg.norm(rays, axis=1)

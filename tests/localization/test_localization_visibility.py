@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from ground_station.geometry import poses
-from ground_station.geometry.lens import Lens
 from ground_station.localization.settings import ProjectionSettings
 from ground_station.localization.visibility import Covisibility, LandmarkIndex, project
 from ground_station.map.store import Keyframes, Landmarks
@@ -37,15 +36,15 @@ def test_the_landmarks_are_those_of_the_plain_projection(room, cone, side_m, cel
     rng = np.random.default_rng(21)
     landmarks = _building(rng, 40_000, side_m)
     index = LandmarkIndex(landmarks, cell_m)
-    lens, settings = Lens(room.camera), ProjectionSettings(viewing_cone=cone)
+    camera, settings = room.camera, ProjectionSettings(viewing_cone=cone)
     seen = 0
     for _ in range(40):
         wTc = poses.exp(
             np.r_[rng.normal(0, 1.5, 3), rng.normal(0, 1, 3) * [side_m / 6, side_m / 6, 2]]
         )
-        plain = project(landmarks, wTc, lens, settings)
-        among = index.near(wTc, lens, settings)
-        indexed = project(landmarks, wTc, lens, settings, among)
+        plain = project(landmarks, wTc, camera, settings)
+        among = index.near(wTc, camera, settings)
+        indexed = project(landmarks, wTc, camera, settings, among)
         assert indexed.landmark.tolist() == plain.landmark.tolist()
         assert np.allclose(indexed.pinhole_px, plain.pinhole_px, atol=1e-9)
         seen += len(plain.landmark)
@@ -65,18 +64,18 @@ def test_a_frame_looks_at_no_more_landmarks_when_the_building_grows(room):
             for field in dataclasses.fields(Landmarks)
         }
     )
-    lens, settings = Lens(room.camera), ProjectionSettings(viewing_cone=True)
+    camera, settings = room.camera, ProjectionSettings(viewing_cone=True)
     both = [LandmarkIndex(landmarks) for landmarks in (small, large)]
     for _ in range(10):
         wTc = poses.exp(np.r_[rng.normal(0, 1, 3), rng.normal(0, 1, 3)])
-        few, many = (len(index.near(wTc, lens, settings)) for index in both)
+        few, many = (len(index.near(wTc, camera, settings)) for index in both)
         assert few <= many <= 1.3 * few + 50
         assert many < 0.1 * len(large)
 
 
 def test_an_index_of_nothing_sees_nothing(room):
     index = LandmarkIndex(_building(np.random.default_rng(0), 0, 10.0))
-    assert len(index.near(np.eye(4), Lens(room.camera), ProjectionSettings())) == 0
+    assert len(index.near(np.eye(4), room.camera, ProjectionSettings())) == 0
 
 
 def _keyframes(position_m, seen):

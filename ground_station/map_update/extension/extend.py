@@ -15,7 +15,6 @@ import numpy as np
 from ground_station.arrays import F64, I64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
-from ground_station.geometry.lens import Lens
 from ground_station.localization.settings import LocalizerSettings, ProjectionSettings, load_preset
 from ground_station.localization.visibility import LandmarkIndex, project
 from ground_station.map import colmap, store
@@ -58,10 +57,12 @@ def never_seen(map_: Map, wTc: F64, seen: I64, often: int) -> dict[str, int]:
 
     `seen` are those that were. They are counted and not removed: another light hides, too.
     """
-    lens, index = Lens(map_.info.camera), LandmarkIndex(map_.landmarks)
+    camera, index = map_.info.camera, LandmarkIndex(map_.landmarks)
     times = np.zeros(len(map_.landmarks), np.int64)
     for T in wTc:
-        times[project(map_.landmarks, T, lens, _CONES, index.near(T, lens, _CONES)).landmark] += 1
+        times[
+            project(map_.landmarks, T, camera, _CONES, index.near(T, camera, _CONES)).landmark
+        ] += 1
     expected = times >= often
     missed = expected.copy()
     missed[seen] = False

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ground_station.arrays import F32, F64, I64
-from ground_station.geometry.lens import Lens
 from ground_station.localization.settings import ProjectionSettings
 from ground_station.localization.visibility import LandmarkIndex, project
 from ground_station.map.model import Model
@@ -83,11 +82,13 @@ def _same_place_in_images(
 ) -> I64:
     """Rows (track, landmark) of tracks that are seen where landmarks project."""
     map_, count = structure.map, len(structure.map.landmarks)
-    lens, index = Lens(map_.info.camera), LandmarkIndex(map_.landmarks)
+    camera, index = map_.info.camera, LandmarkIndex(map_.landmarks)
     pairs = [np.empty((0, 2), np.int64)]
     for k, wTc in enumerate(model.wTc):
         rows = np.flatnonzero((model.image == k) & (model.point_id[model.point] - 1 >= count))
-        shown = project(map_.landmarks, wTc, lens, projection, index.near(wTc, lens, projection))
+        shown = project(
+            map_.landmarks, wTc, camera, projection, index.near(wTc, camera, projection)
+        )
         if not len(rows) or not len(shown.landmark):
             continue
         tree = cKDTree(shown.pinhole_px)
