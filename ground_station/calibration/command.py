@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ground_station.calibration.errors import CalibrationError
+from ground_station.errors import check_options
 from ground_station.files import check_outputs
 
 if TYPE_CHECKING:
@@ -34,7 +35,6 @@ _OF_VIEWS = (
     "report",
 )  # fmt: skip
 _HINTS_S = 5.0
-_MOST_VIEWS = 200
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -145,9 +145,8 @@ def _calibrate(args: argparse.Namespace) -> int:
 
     if args.board is None:
         raise CalibrationError("--board BOARD.toml is needed: what 'blimp calibrate board' wrote")
+    check_options(args, views=(3, 200), seconds=(1, 3600))
     most = MAX_VIEWS if args.views is None else args.views
-    if not 3 <= most <= _MOST_VIEWS:
-        raise CalibrationError(f"--views is {most}; allowed: 3 to {_MOST_VIEWS}")
     board = load_board(args.board)
     measured = parse_measured(args.square_mm_measured) if args.square_mm_measured else None
     finder = BoardFinder(board, board.points_m(measured))
@@ -180,14 +179,14 @@ def _is_live(text: str) -> bool:
 
 def _open(args: argparse.Namespace) -> tuple[list[FrameSource], list[bool]]:
     """The inputs, and of each whether its frames' times are the camera's."""
-    from ground_station.calibration.live import LiveFrames, check_seconds
+    from ground_station.calibration.live import LiveFrames
     from ground_station.recording.flight import FlightRecording
     from ground_station.recording.open import open_input, parse_range
     from ground_station.recording.video import VideoFile
 
     rate_hz = 30.0 if args.rate_hz is None else args.rate_hz
     wanted = parse_range(args.range) if args.range else None
-    seconds = check_seconds(60.0 if args.seconds is None else args.seconds)
+    seconds = 60.0 if args.seconds is None else args.seconds
     sources: list[Any] = [
         LiveFrames(text, seconds) if _is_live(text) else open_input(text, rate_hz, wanted)
         for text in args.inputs

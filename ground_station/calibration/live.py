@@ -6,7 +6,6 @@ import re
 import time
 from collections.abc import Iterator
 
-from ground_station.calibration.errors import CalibrationError
 from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.recording.frames import Frame
@@ -83,10 +82,3 @@ class LiveFrames:
 def _whoever_comes(ssrc: int, key_owner: str | None, age_s: float) -> str | None:
     """The one payload before the board: no telemetry says whose a stream is."""
     return "payload" if age_s > 0 else None
-
-
-def check_seconds(seconds: float) -> float:
-    """The seconds to look at a live stream; raises `CalibrationError` out of 1 to 3600."""
-    if not 1 <= seconds <= 3600:  # NaN fails, too
-        raise CalibrationError(f"--seconds is {seconds:g}; allowed: 1 to 3600")
-    return seconds

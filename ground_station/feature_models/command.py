@@ -6,14 +6,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ground_station.errors import check_options
 from ground_station.files import write_json
 
 if TYPE_CHECKING:
     from ground_station.feature_models.quantize import Comparison
     from ground_station.features.model_info import Model
 
-_FRAMES = (4, 512)
-_THREADS = (1, 64)
 _SIZE_PX = (640, 480)
 
 _LIST_EXAMPLE = """\
@@ -100,6 +99,7 @@ def run(args: argparse.Namespace) -> int:
 def _list(_: argparse.Namespace) -> dict[str, Any]:
     from ground_station.features import catalogue, extractors
     from ground_station.features.extractor import FeatureError
+    from ground_station.presentation.text import columns
 
     models, broken = [], {}
     for name in catalogue.names():
@@ -107,15 +107,13 @@ def _list(_: argparse.Namespace) -> dict[str, Any]:
             models.append(_described(catalogue.find(name)))
         except FeatureError as error:
             broken[name] = str(error)
-    print(f"{'name':<22}{'layout':<8}{'dim':>5}{'MB':>7}{'GMAC':>8}  {'sha256':<14}where")
+    rows = [["name", "layout", "dim", "MB", "GMAC", "sha256", "where"]]
     for each in models:
-        print(
-            f"{each['name']:<22}{each['layout']:<8}{each['dimension']:>5}"
-            f"{each['bytes'] / 1e6:>7.2f}{each['gmac_640x480']:>8.2f}  {each['sha256'][:12]:<14}"
-            f"{'shipped' if each['shipped'] else each['file']}"
-        )
-    for name, reason in broken.items():
-        print(f"{name:<22}{reason}")
+        where = "shipped" if each["shipped"] else each["file"]
+        size, cost = f"{each['bytes'] / 1e6:.2f}", f"{each['gmac_640x480']:.2f}"
+        dimension, sha256 = str(each["dimension"]), each["sha256"][:12]
+        rows.append([each["name"], each["layout"], dimension, size, cost, sha256, where])
+    print("\n".join([*columns(rows), *(f"{name}: {why}" for name, why in broken.items())]))
     methods = sorted(set(extractors.names()) - set(catalogue.names()))
     print(f"methods without a model: {', '.join(methods)}")
     return {"models": models, "unreadable": broken, "methods": methods}
@@ -149,13 +147,7 @@ def _quantize(args: argparse.Namespace) -> dict[str, Any]:
     from ground_station.features.model_info import Model
     from ground_station.recording.open import open_input, parse_range
 
-    for option, value, (low, high) in (
-        ("--frames", args.frames, _FRAMES),
-        ("--threads", args.threads, _THREADS),
-        ("--seed", args.seed, (0, 2**32 - 1)),
-    ):
-        if not low <= value <= high:
-            raise FeatureError(f"{option} is {value}; allowed: {low} to {high}")
+    check_options(args, frames=(4, 512), threads=(1, 64), seed=(0, 2**32 - 1))
     name = args.name or f"{args.model}-int8"
     extractors.check_free(name)
     if name in catalogue.names():
@@ -175,23 +167,25 @@ def _quantize(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _print_comparison(reference: Model, made: Model, result: Comparison, threads: int) -> None:
+    from ground_station.presentation.text import columns
+
     gain = 100 * (result.variant.accuracy - result.reference.accuracy)
     height, width = result.shape
-    print(f"{'':<22}{'accuracy at 3 px':>18}{'correct':>9}{'matches':>9}{'ms':>8}{'MB':>7}")
-    rows = (
+    rows = [["", "accuracy at 3 px", "correct", "matches", "ms", "MB"]]
+    for model, found, ms in (
         (reference, result.reference, result.reference_ms),
         (made, result.variant, result.variant_ms),
-    )
-    for model, matching, ms in rows:
-        print(
-            f"{model.info.name:<22}{matching.accuracy:>18.3f}{matching.correct:>9}"
-            f"{matching.matches:>9}{ms:>8.1f}{len(model.data) / 1e6:>7.2f}"
-        )
+    ):
+        size = f"{len(model.data) / 1e6:.2f}"
+        counts = str(found.correct), str(found.matches)
+        rows.append([model.info.name, f"{found.accuracy:.3f}", *counts, f"{ms:.1f}", size])
     print(
+        *columns(rows),
         f"matching accuracy {gain:+.1f} points over {result.pairs} pairs; "
-        f"time of the network: {result.time_ratio:.2f} at {width}x{height}, threads: {threads}"
+        f"time of the network: {result.time_ratio:.2f} at {width}x{height}, threads: {threads}",
+        f"written: {made.path}",
+        sep="\n",
     )
-    print(f"written: {made.path}")
 
 
 def _document(result: Comparison, args: argparse.Namespace) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import os
 from dataclasses import fields, replace
 from pathlib import Path
 
+from ground_station.errors import check_options
 from ground_station.training.errors import TrainingError
 
 _EXAMPLE = """\
@@ -71,10 +72,10 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.training.loop import Machine, train
     from ground_station.training.recipe import Recipe
 
-    for name, low, high in (("threads", 0, 256), ("jobs", 0, 256), ("checkpoint_every", 1, 10**6),
-                            ("validate_every", 1, 10**6)):  # fmt: skip
-        if not low <= getattr(args, name) <= high:
-            raise TrainingError(f"{name} is {getattr(args, name)}; allowed: {low} to {high}")
+    check_options(
+        args, threads=(0, 256), jobs=(0, 256), checkpoint_every=(1, 10**6),
+        validate_every=(1, 10**6),
+    )  # fmt: skip
     given = {f.name: getattr(args, f.name) for f in fields(Recipe)
              if getattr(args, f.name, None) is not None and f.name != "corpus"}  # fmt: skip
     if args.steps is not None:  # a short run has a short end
