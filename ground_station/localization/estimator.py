@@ -14,7 +14,7 @@ from ground_station.geometry.camera import Camera
 from ground_station.localization.kinematics import Kinematics, LandmarkObservations, Solution
 from ground_station.localization.pose_alone import solve_graph
 from ground_station.localization.pose_rolling import solve_rolling
-from ground_station.localization.settings import LocalizerSettings, MotionSettings, PoseSettings
+from ground_station.localization.settings import LocalizerSettings, PoseSettings
 from ground_station.localization.smoother import FixedLagSmoother
 
 
@@ -28,47 +28,6 @@ def constant_velocity(wTc_before: npt.ArrayLike, wTc_last: npt.ArrayLike, fracti
     # Each product of products doubles the rounding error, and a solver keeps what it starts from:
     # unless it is made a rotation again, some fifty frames later it is none.
     return poses.from_quaternion(wTc[:3, 3], poses.to_quaternion(wTc))
-
-
-class MotionModel:
-    """The last two solved poses and what they predict, without covariance, as in the thesis.
-
-    The setting `blimp` needs velocities and goes on at constant velocity here: see `process`.
-    """
-
-    def __init__(self, settings: MotionSettings) -> None:
-        self.settings = settings
-        self._last: tuple[int, F64] | None = None
-        self._before: tuple[int, F64] | None = None
-
-    def restart(self, time_ns: int, wTc: F64) -> None:
-        """A pose from elsewhere, with no velocity: a given first one or a relocalization."""
-        self._last, self._before = (time_ns, wTc), None
-
-    def update(self, time_ns: int, wTc: F64) -> None:
-        """A solved pose (4, 4), later than the last."""
-        if self._last is None or time_ns <= self._last[0]:
-            self.restart(time_ns, wTc)
-        else:
-            self._before, self._last = self._last, (time_ns, wTc)
-
-    def predict(self, time_ns: int) -> F64 | None:
-        """The expected pose (4, 4) at a time, or None when no pose was ever known.
-
-        The velocity is that of the last two solved poses, whatever the time between them up to
-        `max_step_s`. It is carried on for `coast_s`; after that the pose is held, because an
-        unsupported velocity would leave the building.
-        """
-        if self._last is None:
-            return None
-        last_ns, wTc = self._last
-        if self.settings.model == "static" or self._before is None:
-            return wTc
-        step_ns = last_ns - self._before[0]
-        if step_ns > self.settings.max_step_s * 1e9:
-            return wTc
-        ahead_ns = min(time_ns - last_ns, self.settings.coast_s * 1e9)
-        return constant_velocity(self._before[1], wTc, ahead_ns / step_ns)
 
 
 class Estimator(Protocol):
@@ -100,27 +59,43 @@ class Estimator(Protocol):
 
     def smoothed(self) -> list[Kinematics]:
         """States that later frames helped to estimate, each once, when they are final."""
-        ...
+        return []
 
     def flush(self) -> list[Kinematics]:
         """`smoothed` and the states that no later frame will help; all is then forgotten."""
-        ...
+        return []
 
 
-class PoseEstimator:
-    """Each frame's pose from that frame alone; the last two poses predict the next (thesis)."""
+class PoseEstimator(Estimator):
+    """Each frame's pose from that frame alone; the last two poses predict the next (thesis).
+
+    Nothing is known of how good a prediction is. The setting `blimp` needs velocities and goes on
+    at constant velocity here: see `process`.
+    """
 
     def __init__(self, camera: Camera, settings: LocalizerSettings) -> None:
-        self._camera = camera
-        self._motion = MotionModel(settings.motion)
+        self._camera, self._motion = camera, settings.motion
+        self._last: tuple[int, F64] | None = None
+        self._before: tuple[int, F64] | None = None
 
     def restart(self, time_ns: int, wTc: F64, covariance: F64 | None = None) -> None:
-        self._motion.restart(time_ns, wTc)
+        self._last, self._before = (time_ns, wTc), None
 
     def predict(self, time_ns: int, wild: bool = False) -> Kinematics | None:
-        wTc = self._motion.predict(time_ns)
-        # Nothing is known of how good the prediction is.
-        return None if wTc is None else Kinematics(time_ns, wTc, np.zeros(6), _UNKNOWN)
+        """The velocity is that of the last two poses, whatever the time between them up to
+        `max_step_s`. It is carried on for `coast_s`; after that the pose is held, because an
+        unsupported velocity would leave the building.
+        """
+        if self._last is None:
+            return None
+        last_ns, wTc = self._last
+        if self._before is not None and self._motion.model != "static":
+            before_ns, before = self._before
+            step_ns = last_ns - before_ns
+            if step_ns <= self._motion.max_step_s * 1e9:
+                ahead_ns = min(time_ns - last_ns, self._motion.coast_s * 1e9)
+                wTc = constant_velocity(before, wTc, ahead_ns / step_ns)
+        return Kinematics(time_ns, wTc, np.zeros(6), _UNKNOWN)
 
     def solve(
         self, predicted: Kinematics, observations: LandmarkObservations, settings: PoseSettings
@@ -130,21 +105,18 @@ class PoseEstimator:
         return solve_graph(predicted, observations, self._camera, settings)
 
     def update(self, solution: Solution, wild: bool = False) -> Kinematics:
-        assert solution.state is not None
-        self._motion.update(solution.state.time_ns, solution.state.wTc)
-        return solution.state
-
-    def smoothed(self) -> list[Kinematics]:
-        return []
-
-    def flush(self) -> list[Kinematics]:
-        return []
+        state = solution.state
+        assert state is not None
+        later = self._last is not None and state.time_ns > self._last[0]
+        self._before = self._last if later else None
+        self._last = state.time_ns, state.wTc
+        return state
 
 
 _UNKNOWN = np.full((12, 12), np.nan)
 
 
-class FilterEstimator:
+class FilterEstimator(Estimator):
     """Pose and velocity from prediction and observations together, rows at their own times."""
 
     def __init__(
@@ -173,14 +145,7 @@ class FilterEstimator:
         return solve_rolling(predicted, observations, self._camera, settings)
 
     def update(self, solution: Solution, wild: bool = False) -> Kinematics:
-        state = solution.state
-        assert state is not None
-        latest = self._smoother.latest
-        if latest is None or state.time_ns <= latest.time_ns:
-            # A given pose's own frame: the solution already holds what was given.
-            self._smoother.restart(state)
-            return state
-        return self._smoother.update(state.time_ns, solution, wild)
+        return self._smoother.update(solution, wild)
 
     def smoothed(self) -> list[Kinematics]:
         return self._smoother.smoothed()

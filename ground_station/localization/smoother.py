@@ -65,10 +65,8 @@ class FixedLagSmoother:
     def restart(self, state: Kinematics) -> None:
         """Forgets all, also the states not asked for, and starts from a state's covariance.
 
-        A covariance that is none is replaced by a vague one. Raises `ValueError` when the pose or
-        the twist is not finite.
+        A covariance that is none is replaced by a vague one.
         """
-        self._check(state)
         self._left = []
         self._start(state)
 
@@ -85,25 +83,22 @@ class FixedLagSmoother:
             return self._advance(self.latest, time_ns, self._adaptation.limit).state
         return self._expect(self.latest, time_ns).state
 
-    def update(self, time_ns: int, solution: Solution, wild: bool = False) -> Kinematics:
+    def update(self, solution: Solution, wild: bool = False) -> Kinematics:
         """Adds a solved frame and returns the newest state with its covariance, causal.
 
         `wild`: it was solved with the wild prediction, so the densities become what it needs.
         `solution.information` and `.gradient` are of the frame's observations alone, at
         `solution.state`. When they can't be used, or the graph becomes singular, it restarts from
         the solution's own state and covariance; when that is not finite either, from the
-        prediction. Raises `ValueError` when there is no state, or its time is not after the newest.
+        prediction. Where nothing came before its time, it starts from the solution, too.
         """
-        state = solution.state
-        if state is None:
-            raise ValueError("a solution without a state can't be added")
-        state = Kinematics(time_ns, state.wTc, state.twist, state.covariance)
-        latest = self.latest
-        if latest is None:
-            self._check(state)
+        state, latest = solution.state, self.latest
+        assert state is not None
+        time_ns = state.time_ns
+        if latest is None or time_ns <= latest.time_ns:
+            # A given pose's own frame: the solution already holds what was given.
+            self._left = []
             return self._start(state)
-        if time_ns <= latest.time_ns:
-            raise ValueError(f"time {time_ns} ns is not after the newest, {latest.time_ns} ns")
         self._leave(time_ns)
         try:
             return self._add(latest, state, solution, wild)
@@ -129,11 +124,6 @@ class FixedLagSmoother:
         self._drain()
         self.latest = None
         return self.smoothed()
-
-    @staticmethod
-    def _check(state: Kinematics) -> None:
-        if not _finite(state):
-            raise ValueError("the state to start from is not finite")
 
     def _clear(self) -> None:
         parameters = gtsam.ISAM2Params()

@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 
 from ground_station.geometry import poses
-from ground_station.localization.estimator import MotionModel, constant_velocity
+from ground_station.geometry.camera import THESIS_CAMERA
+from ground_station.localization.estimator import PoseEstimator, constant_velocity
+from ground_station.localization.kinematics import Kinematics, Solution, no_solution
 from ground_station.localization.settings import (
     LocalizerSettings,
     MotionSettings,
@@ -40,36 +42,45 @@ def test_constant_velocity_makes_the_last_step_once_more():
     assert np.allclose(third, second @ np.linalg.inv(first) @ second, atol=1e-12)
 
 
+def _alone(**motion) -> PoseEstimator:
+    return PoseEstimator(THESIS_CAMERA, LocalizerSettings(motion=MotionSettings(**motion)))
+
+
+def _solved(time_ns: int, wTc: np.ndarray) -> Solution:
+    state = Kinematics(time_ns, wTc, np.zeros(6), np.zeros((12, 12)))
+    return dataclasses.replace(no_solution(0, ""), state=state)
+
+
+def _along_x(metres: float) -> np.ndarray:
+    return poses.pose(np.eye(3), [metres, 0, 0])
+
+
 def test_predictions_stay_rotations_over_a_long_flight():
-    model = MotionModel(MotionSettings())
+    estimator = _alone()
     wTc = poses.exp([0.3, -0.2, 0.1, 1.0, 2.0, 3.0])
-    model.restart(0, wTc)
-    model.update(33, wTc @ poses.exp([0.01, 0.02, -0.01, 0.02, 0.0, 0.01]))
+    estimator.restart(0, wTc)
+    estimator.update(_solved(33, wTc @ poses.exp([0.01, 0.02, -0.01, 0.02, 0.0, 0.01])))
     for k in range(2, 2000):
-        predicted = model.predict(33 * k)
-        model.update(33 * k, predicted)
+        predicted = estimator.predict(33 * k).wTc
+        estimator.update(_solved(33 * k, predicted))
     assert np.abs(predicted[:3, :3] @ predicted[:3, :3].T - np.eye(3)).max() < 1e-12
 
 
 def test_a_late_frame_stretches_the_prediction_until_it_is_held():
-    settings = MotionSettings(coast_s=0.2)
-    model = MotionModel(settings)
-    model.restart(0, np.eye(4))
-    model.update(100_000_000, poses.pose(np.eye(3), [0.1, 0, 0]))
-    assert model.predict(200_000_000)[0, 3] == pytest.approx(0.2)
-    assert model.predict(250_000_000)[0, 3] == pytest.approx(0.25)
-    assert model.predict(9_000_000_000)[0, 3] == pytest.approx(0.3)
-    static = MotionModel(dataclasses.replace(settings, model="static"))
-    static.restart(0, np.eye(4))
-    static.update(100_000_000, poses.pose(np.eye(3), [0.1, 0, 0]))
-    assert static.predict(200_000_000)[0, 3] == pytest.approx(0.1)
+    estimator, static = _alone(coast_s=0.2), _alone(coast_s=0.2, model="static")
+    for each in (estimator, static):
+        each.restart(0, np.eye(4))
+        each.update(_solved(100_000_000, _along_x(0.1)))
+    for time_ns, x_m in ((200_000_000, 0.2), (250_000_000, 0.25), (9_000_000_000, 0.3)):
+        assert estimator.predict(time_ns).wTc[0, 3] == pytest.approx(x_m)
+    assert static.predict(200_000_000).wTc[0, 3] == pytest.approx(0.1)
 
 
 def test_steps_too_far_apart_give_no_velocity():
-    model = MotionModel(MotionSettings(max_step_s=0.5))
-    model.restart(0, np.eye(4))
-    model.update(600_000_000, poses.pose(np.eye(3), [1.0, 0, 0]))
-    assert model.predict(700_000_000)[0, 3] == pytest.approx(1.0)
+    estimator = _alone(max_step_s=0.5)
+    estimator.restart(0, np.eye(4))
+    estimator.update(_solved(600_000_000, _along_x(1.0)))
+    assert estimator.predict(700_000_000).wTc[0, 3] == pytest.approx(1.0)
 
 
 def test_projection_agrees_with_gtsam_and_opencv(room):
