@@ -104,7 +104,7 @@ def _texture(bank: TextureBank, size: tuple[int, int], rng: Rng) -> F32:
     fields = (*bank.coarse, *bank.middle, bank.fine, bank.leaves - 0.5, bank.chips - 0.5)
     one = fields[int(rng.integers(len(fields)))]
     zoom = np.exp(rng.normal(0.2, 0.5, 2))
-    window = bank.stretched(one, *size, rng, float(zoom[0]), float(zoom[1]))
+    window = bank.window(one, *size, rng, float(zoom[0]), float(zoom[1]))
     return np.asarray(np.maximum(1 + np.float32(rng.uniform(0.05, 0.5)) * window, 0.05), np.float32)
 
 

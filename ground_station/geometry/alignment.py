@@ -52,15 +52,14 @@ def align(
     line or in one place, about which a rotation is not determined.
     """
     x, y = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
-    if x.ndim != 2 or x.shape[1] != 3 or x.shape != y.shape:
-        raise GeometryError(f"alignment: needs two (N, 3) arrays, not {x.shape} and {y.shape}")
-    w = _normalized(weights, len(x))
+    w = np.ones(len(x)) if weights is None else np.asarray(weights, dtype=np.float64)
     used = int(np.count_nonzero(w))
     if used < MIN_POINTS:
         raise GeometryError(f"alignment: {used} points; at least {MIN_POINTS} are needed")
     if not (np.all(np.isfinite(x)) and np.all(np.isfinite(y))):
         raise GeometryError("alignment: a coordinate is not a finite number")
 
+    w = w / w.sum()
     rotation, translation, scale, determined = similarities(x, y, w)
     if not determined:
         raise GeometryError("alignment: the points lie on one line or in one place")
@@ -87,16 +86,6 @@ def similarities(x: F64, y: F64, w: F64) -> tuple[F64, F64, F64, Bools]:
         scale = np.sum(D * S, axis=-1) / variance_x  # eq. 42
         translation = mean_y - scale[..., None] * np.einsum("...ij,...j", rotation, mean_x)  # 41
     return rotation, translation, scale, determined
-
-
-def _normalized(weights: npt.ArrayLike | None, n: int) -> F64:
-    """Weights (n,) that sum to 1."""
-    if weights is None:
-        return np.full(n, 1.0 / n) if n else np.empty(0)
-    w = np.asarray(weights, dtype=np.float64)
-    if w.shape != (n,) or not np.all(np.isfinite(w)) or np.any(w < 0) or not np.any(w > 0):
-        raise GeometryError(f"alignment: weights must be {n} finite numbers >= 0, not all zero")
-    return np.asarray(w / w.sum())
 
 
 def spread_out(places: F64, count: int, least: float = 0.0) -> list[int]:

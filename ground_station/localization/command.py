@@ -62,21 +62,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def load_settings(args: argparse.Namespace) -> LocalizerSettings:
-    """The settings the arguments ask for; raises `ConfigError` with one line."""
-    from dataclasses import asdict
+    """The settings the arguments ask for; raises `BlimpError` with one line."""
+    from dataclasses import replace
 
+    from ground_station.errors import check_options
     from ground_station.localization.settings import LocalizerSettings, load_preset
     from pi_firmware.wire import config
 
-    if args.settings:
-        settings = config.load(args.settings, LocalizerSettings)
-    else:
-        settings = load_preset(args.preset)
-    if args.min_entropy_bits is None:
-        return settings
-    document: dict[str, Any] = asdict(settings)
-    document["gate"]["min_entropy_bits"] = args.min_entropy_bits
-    return config.from_mapping(document, LocalizerSettings, where="--min-entropy-bits")
+    check_options(args, min_entropy_bits=(0, 8))
+    settings = (
+        config.load(args.settings, LocalizerSettings) if args.settings else load_preset(args.preset)
+    )
+    if args.min_entropy_bits is not None:
+        gate = replace(settings.gate, min_entropy_bits=args.min_entropy_bits)
+        settings = replace(settings, gate=gate)
+    return settings
 
 
 def run(args: argparse.Namespace) -> int:

@@ -63,14 +63,15 @@ class TextureBank:
         self.leaves = dead_leaves(_FIELD_SIZE, 3, 90, rng)
         self.chips = dead_leaves(_FIELD_SIZE, 1.2, 9, rng)
 
-    def window(self, field: F32, rows: int, columns: int, rng: Rng, zoom: float = 1.0) -> F32:
-        """A random window of a field, mirrored at its borders, magnified by `zoom` in x and y."""
-        return self.stretched(field, rows, columns, rng, zoom, zoom)
+    def window(
+        self, field: F32, rows: int, columns: int, rng: Rng, zoom_x: float = 1.0,
+        zoom_y: float | None = None,
+    ) -> F32:  # fmt: skip
+        """A random window of a field, mirrored at its borders, magnified in x, and in y alike.
 
-    def stretched(
-        self, field: F32, rows: int, columns: int, rng: Rng, zoom_x: float, zoom_y: float
-    ) -> F32:
-        """As `window`, with a zoom along each axis: grain and brushed metal."""
+        With another `zoom_y` it is stretched: grain and brushed metal.
+        """
+        zoom_y = zoom_x if zoom_y is None else zoom_y
         h, w = max(2, round(rows / zoom_y)), max(2, round(columns / zoom_x))
         y = (int(rng.integers(_FIELD_SIZE)) + np.arange(h)) % _FIELD_SIZE
         x = (int(rng.integers(_FIELD_SIZE)) + np.arange(w)) % _FIELD_SIZE
@@ -137,7 +138,7 @@ def plaster(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o
 def concrete(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """Cast concrete: clouds, pores, streaks of water, form ties on a regular grid."""
     shade = _grime(b, rows, columns, rng, 0.24)
-    shade += 0.10 * b.stretched(b.middle[1], rows, columns, rng, 0.5, 4.0)
+    shade += 0.10 * b.window(b.middle[1], rows, columns, rng, 0.5, 4.0)
     pores = b.window(b.chips, rows, columns, rng)
     shade *= np.where(pores > 0.93, 0.62, 1).astype(np.float32)
     tie = o.get("tie_m", 0.0) * scale
@@ -179,8 +180,8 @@ def wood(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: A
     shade = np.empty((h, w), np.float32)
     for top in range(0, h, plank):
         n = min(plank, h - top)
-        grain = b.stretched(b.middle[0], n, w, rng, 14.0, 0.9)
-        rings = np.sin(6 * b.stretched(b.coarse[1], n, w, rng, 8.0, 1.2)).astype(np.float32)
+        grain = b.window(b.middle[0], n, w, rng, 14.0, 0.9)
+        rings = np.sin(6 * b.window(b.coarse[1], n, w, rng, 8.0, 1.2)).astype(np.float32)
         shade[top : top + n] = rng.uniform(0.72, 1.25) * (1 + 0.16 * grain + 0.10 * rings)
         shade[top] *= 0.45
     if upright:
@@ -216,7 +217,7 @@ def fabric(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o:
 def metal(b: TextureBank, rows: int, columns: int, scale: float, rng: Rng, **o: Any) -> F32:
     """Brushed and worn metal."""
     shade = _grime(b, rows, columns, rng, 0.18)
-    shade += 0.10 * b.stretched(b.middle[0], rows, columns, rng, 10.0, 0.8)
+    shade += 0.10 * b.window(b.middle[0], rows, columns, rng, 10.0, 0.8)
     return _paint(shade, o.get("rgb", (0.30, 0.31, 0.33)))
 
 

@@ -206,7 +206,7 @@ def test_an_interrupted_run_writes_what_was_finished(flight, tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("more", "text"),
     [
-        (["--min-entropy-bits", "9"], "min_entropy_bits"),
+        (["--min-entropy-bits", "9"], "min-entropy-bits"),
         (["--init", "absent.txt"], "absent.txt"),
         (["--range", "90:95"], "90:95"),
         (["--settings", "absent.toml"], "absent.toml"),
