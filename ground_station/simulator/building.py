@@ -146,6 +146,12 @@ class SceneBuilder:
         """Adds walls to the floor plan: low x, low y, high x, high y of each."""
         self.footprints += [Footprint(bounds, "wall") for bounds in bounds_m]
 
+    def outer_walls(self, length_m: float, width_m: float) -> None:
+        """Adds the four walls around a hall to the floor plan, 0.3 m thick."""
+        x, y = length_m + 0.3, width_m + 0.3
+        self.walls((-0.3, -0.3, x, 0.0), (-0.3, width_m, x, y),
+                   (-0.3, 0.0, 0.0, width_m), (length_m, 0.0, x, width_m))  # fmt: skip
+
     def survey(self, name: str, surface: Surface, corner: int) -> None:
         """Makes a corner of a surface (0: origin, 1: +u, 2: +u+v, 3: +v) a known point."""
         x, y, z = surface.corners()[corner].tolist()

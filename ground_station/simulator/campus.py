@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from ground_station.arrays import F32, F64, I64, Bools
 from ground_station.features.extractor import Features
+from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 
 CAMERA = Camera(240, 180, 120.0, 120.0, 119.5, 89.5, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -180,14 +181,10 @@ def _poses(nodes: I64, images: int) -> F64:
     due = np.searchsorted(np.cumsum(moved), np.arange(images))
     place, yaw = path[due], yaw[due]
     height = _EYE_M + 0.15 * np.sin(along[due] / 2.0)
-    wTc = np.tile(np.eye(4), (images, 1, 1))
-    zero = np.zeros(images)
+    x, y, zero = np.cos(yaw), np.sin(yaw), np.zeros(images)
     # Columns: the camera's right, down and forward in the world.
-    wTc[:, :3, 0] = np.stack([np.sin(yaw), -np.cos(yaw), zero], axis=1)
-    wTc[:, :3, 1] = [0.0, 0.0, -1.0]
-    wTc[:, :3, 2] = np.stack([np.cos(yaw), np.sin(yaw), zero], axis=1)
-    wTc[:, :3, 3] = np.column_stack([place, height])
-    return wTc
+    rotation = np.array([[y, zero, x], [-x, zero, y], [zero, zero - 1, zero]])
+    return poses.pose(np.moveaxis(rotation, 2, 0), np.column_stack([place, height]))
 
 
 def _points(free: Bools, corner: F64, rng: np.random.Generator) -> F64:

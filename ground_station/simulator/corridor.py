@@ -56,8 +56,5 @@ def build_corridor(texels_per_m: float) -> Scene:
                   print=_DOOR + 20)  # fmt: skip
     b.rectangle([0, 0, 0], [0, WIDTH_M, 0], [0, 0, HEIGHT_M], "brick")
     b.rectangle([LENGTH_M, WIDTH_M, 0], [0, -WIDTH_M, 0], [0, 0, HEIGHT_M], "plaster", rgb=_GREEN)
-    b.walls(
-        (-0.3, -0.3, LENGTH_M + 0.3, 0.0), (-0.3, WIDTH_M, LENGTH_M + 0.3, WIDTH_M + 0.3),
-        (-0.3, 0.0, 0.0, WIDTH_M), (LENGTH_M, 0.0, LENGTH_M + 0.3, WIDTH_M),
-    )  # fmt: skip
+    b.outer_walls(LENGTH_M, WIDTH_M)
     return b.scene("corridor", (LENGTH_M, WIDTH_M, HEIGHT_M), TEXTURE_SEED)

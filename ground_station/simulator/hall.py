@@ -141,10 +141,7 @@ def build_hall(
 ) -> Scene:
     """The scene `hall`, glazed, or the floor above it, in coordinates of its own floor."""
     b = SceneBuilder(texels_per_m, storey=int(above), alike=alike)
-    b.walls(
-        (-0.3, -0.3, LENGTH_M + 0.3, 0.0), (-0.3, WIDTH_M, LENGTH_M + 0.3, WIDTH_M + 0.3),
-        (-0.3, 0.0, 0.0, WIDTH_M), (LENGTH_M, 0.0, LENGTH_M + 0.3, WIDTH_M),
-    )  # fmt: skip
+    b.outer_walls(LENGTH_M, WIDTH_M)
     for i in range(6):
         for j in range(3):
             b.rectangle([3 * i, 4 * j, 0], [3, 0, 0], [0, 4, 0], "terrazzo", slab_m=0.75,
