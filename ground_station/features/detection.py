@@ -48,7 +48,8 @@ def strongest(
     """
     shape = scores.shape
     flat = np.ascontiguousarray(scores).ravel()
-    left = _above(flat.reshape(shape), threshold)
+    above = cv2.threshold(flat.reshape(shape), threshold, 0, cv2.THRESH_TOZERO)[1]
+    left = np.asarray(above, np.float32)
     window = np.ones((2 * radius_px + 1, 2 * radius_px + 1), np.uint8)
     taken: list[Indices] = []
     inside = np.empty(0, np.float32)  # scores of those taken that lie off the border
@@ -78,12 +79,6 @@ def strongest(
     order = np.lexsort((found, -flat[found]))[:most]
     rows, columns = np.divmod(found[order], shape[1])
     return rows, columns
-
-
-def _above(scores: F32, threshold: float) -> F32:
-    """The scores that are above the threshold, 0 in place of the others; a copy."""
-    _, left = cv2.threshold(scores, threshold, 0, cv2.THRESH_TOZERO)
-    return np.asarray(left, np.float32)
 
 
 def _one_by_one(scores: F32, radius_px: int, border_px: int, most: int) -> Indices:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 import time
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ground_station.arrays import Bools, Indices
-from ground_station.localization.estimate import Counts, no_observations
+from ground_station.localization.estimate import Counts, PoseEstimate, State, no_observations
 from ground_station.localization.kinematics import Kinematics
 from pi_firmware.wire import annexb
 
@@ -69,3 +70,10 @@ class Attempt:
         self.predicted: Kinematics | None = None
         self.counts = Counts()
         self.observations = no_observations()
+
+    def estimate(self, state: State, reason: str, **more: Any) -> PoseEstimate:
+        """What became of it; `more` are the estimate's other fields, of a frame that was solved."""
+        return PoseEstimate(
+            self.time_ns, self.index, state, reason, counts=self.counts,
+            observations=self.observations, stage_ms=self.watch.finish(), **more,
+        )  # fmt: skip

@@ -116,17 +116,17 @@ class PoseEstimator(Estimator):
 _UNKNOWN = np.full((12, 12), np.nan)
 
 
-class FilterEstimator(Estimator):
+class FilterEstimator(FixedLagSmoother):
     """Pose and velocity from prediction and observations together, rows at their own times."""
 
     def __init__(
         self, camera: Camera, settings: LocalizerSettings, smoothing: bool = False
     ) -> None:
-        self._camera, self._settings = camera, settings
-        self._smoother = FixedLagSmoother(settings.motion, keep=smoothing)
+        super().__init__(settings.motion, keep=smoothing)
+        self._camera, self._from = camera, settings.start
 
     def restart(self, time_ns: int, wTc: F64, covariance: F64 | None = None) -> None:
-        start = self._settings.start
+        start = self._from
         sigma = np.r_[
             np.full(3, np.deg2rad(start.sigma_deg)), np.full(3, start.sigma_m),
             np.full(3, np.deg2rad(start.turn_deg_s)), np.full(3, start.speed_m_s),
@@ -134,24 +134,12 @@ class FilterEstimator(Estimator):
         full = np.diag(sigma**2)
         if covariance is not None:
             full[:6, :6] = covariance
-        self._smoother.restart(Kinematics(time_ns, wTc, np.zeros(6), full))
-
-    def predict(self, time_ns: int, wild: bool = False) -> Kinematics | None:
-        return self._smoother.predict(time_ns, wild)
+        self.begin(Kinematics(time_ns, wTc, np.zeros(6), full))
 
     def solve(
         self, predicted: Kinematics, observations: LandmarkObservations, settings: PoseSettings
     ) -> Solution:
         return solve_rolling(predicted, observations, self._camera, settings)
-
-    def update(self, solution: Solution, wild: bool = False) -> Kinematics:
-        return self._smoother.update(solution, wild)
-
-    def smoothed(self) -> list[Kinematics]:
-        return self._smoother.smoothed()
-
-    def flush(self) -> list[Kinematics]:
-        return self._smoother.flush()
 
 
 def make_estimator(

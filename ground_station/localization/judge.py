@@ -1,4 +1,4 @@
-"""What may be said of a frame: its covariance, its state and why it is not better, its estimate."""
+"""What may be said of a frame: its covariance, its state and why it is not better."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from ground_station.arrays import F64
 from ground_station.geometry.camera import Camera
 from ground_station.localization.attempt import Attempt
-from ground_station.localization.estimate import PoseEstimate, State
-from ground_station.localization.kinematics import Kinematics, Solution
+from ground_station.localization.estimate import State
+from ground_station.localization.kinematics import Solution
 from ground_station.localization.relocalization import spread
 from ground_station.localization.settings import CovarianceSettings, StateSettings
 from ground_station.map.uncertainty import Accuracy
@@ -75,35 +75,6 @@ def evidence_of(
         support_ns=support_ns,
         denied=denied,
         sharpness=attempt.taken.sharpness,
-    )
-
-
-def publish(
-    attempt: Attempt,
-    state: State,
-    reason: str,
-    *,
-    found: Kinematics | None = None,
-    covariance: F64 | None = None,
-    relocalized: bool = False,
-    gated: bool = False,
-    tracked: bool = False,
-) -> PoseEstimate:
-    """The estimate of a frame that was `found`, or that has no pose."""
-    return PoseEstimate(
-        time_ns=attempt.time_ns,
-        index=attempt.index,
-        state=state,
-        reason=reason,
-        wTc=found.wTc if found else None,
-        twist=found.twist if found else None,
-        covariance=covariance,
-        counts=attempt.counts,
-        observations=attempt.observations,
-        stage_ms=attempt.watch.finish(),
-        gated=gated,
-        relocalized=relocalized,
-        tracked=tracked,
     )
 
 

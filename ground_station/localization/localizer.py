@@ -27,7 +27,6 @@ from ground_station.localization.judge import (
     covariance_in_map,
     covariance_in_world,
     evidence_of,
-    publish,
 )
 from ground_station.localization.kinematics import Kinematics, Solution
 from ground_station.localization.lens import against_map, considered
@@ -169,9 +168,10 @@ class Localizer:
         state, motion = self.settings.state, self.settings.motion
         if reason := gate.low_entropy(entropy, self.settings.gate):
             # Skipped is not failed: until the prediction is no more than a held pose.
-            return self._gated(attempt, reason, max(state.lost_after_s, motion.coast_s))
+            patience_s = max(state.lost_after_s, motion.coast_s)
+            return self._unsolved(attempt, reason, patience_s, gated=True)
         if reason := gate.low_contrast(image, self.settings.gate):
-            return self._gated(attempt, reason, state.lost_after_s)
+            return self._unsolved(attempt, reason, state.lost_after_s, gated=True)
         attempt.watch.lap("gate")
         attempt.taken = self._conditions(image, exposure_s, damaged)
         attempt.watch.lap("sharpness")
@@ -218,7 +218,7 @@ class Localizer:
             return None
         state = State.DEGRADED if self.state is State.TRACKING else self.state
         reason = f"refused: {(last - attempt.time_ns) / 1e9:.3f} s before the last frame"
-        return publish(attempt, state, reason)
+        return attempt.estimate(state, reason)
 
     def _unhurried(self, time_ns: int) -> bool:
         """Whether there is time for a frame's own features.
@@ -425,24 +425,18 @@ class Localizer:
         )
         verdict, reason = self._judge.solved(attempt.time_ns, evidence)
         covariance = covariance_in_world(in_map, self._accuracy, state.wTc, settings.map)
-        return publish(
-            attempt, verdict, reason, found=state, covariance=covariance,
+        return attempt.estimate(
+            verdict, reason, wTc=state.wTc, twist=state.twist, covariance=covariance,
             relocalized=relocalized, tracked=followed is not None,
         )  # fmt: skip
 
-    def _unsolved(self, attempt: Attempt, reason: str) -> PoseEstimate:
-        verdict = self._judge.unsolved(attempt.time_ns)
-        self._forget_if_lost(verdict)
-        attempt.observations = no_observations()
-        return publish(attempt, verdict, reason)
-
-    def _gated(self, attempt: Attempt, reason: str, patience_s: float) -> PoseEstimate:
+    def _unsolved(
+        self, attempt: Attempt, reason: str, patience_s: float | None = None, gated: bool = False
+    ) -> PoseEstimate:
         verdict = self._judge.unsolved(attempt.time_ns, patience_s)
-        self._forget_if_lost(verdict)
-        return publish(attempt, verdict, reason, gated=True)
-
-    def _forget_if_lost(self, verdict: State) -> None:
-        """Found again by chance the keyframe would only repeat where the camera was."""
         if verdict is State.LOST and self._keyframe is not None:
+            # Found again by chance the keyframe would only repeat where the camera was.
             self._keyframe, self._followed, self._seen = None, None, None
             self._replace(self._fresh())
+        attempt.observations = no_observations()
+        return attempt.estimate(verdict, reason, gated=gated)

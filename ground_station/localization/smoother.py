@@ -62,7 +62,7 @@ class FixedLagSmoother:
         """The process noise of the next step, as the innovations have set it."""
         return self._adaptation.density
 
-    def restart(self, state: Kinematics) -> None:
+    def begin(self, state: Kinematics) -> None:
         """Forgets all, also the states not asked for, and starts from a state's covariance.
 
         A covariance that is none is replaced by a vague one.

@@ -68,7 +68,7 @@ def drawn(seed: int, count: int, settings: MotionSettings = STEADY) -> Run:
 
 def through(smoother: FixedLagSmoother, run: Run) -> Iterator[tuple[Kinematics, list[Kinematics]]]:
     """The causal state of each frame and the smoothed ones that left with it."""
-    smoother.restart(run.start)
+    smoother.begin(run.start)
     for time_ns, measured in run.measured:
         predicted = smoother.predict(time_ns)
         assert predicted is not None
@@ -210,7 +210,7 @@ def test_lost_frames_stretch_the_prediction_and_no_state_is_lost_in_a_gap():
     run, smoother = drawn(6, 160), FixedLagSmoother(replace(STEADY, coast_s=0.5))
     keep = [*run.measured[:40], *run.measured[52:70], *run.measured[130:]]  # 0.4 s and 2 s
     left, spans = [], []
-    smoother.restart(run.start)
+    smoother.begin(run.start)
     for time_ns, measured in keep:
         predicted = smoother.predict(time_ns)
         spans.append(np.sqrt(np.diag(predicted.covariance)[3:6]).max())
@@ -315,7 +315,7 @@ def test_time_does_not_go_back_and_nothing_is_known_before_a_start():
 def test_frames_a_nanosecond_apart_do_no_harm():
     smoother, rng = FixedLagSmoother(STEADY), np.random.default_rng(11)
     truth = poses.exp([0.1, 0.2, 0.3, 1, 2, 1])
-    smoother.restart(Kinematics(0, truth, np.zeros(6), START))
+    smoother.begin(Kinematics(0, truth, np.zeros(6), START))
     for time_ns in range(1, 40):
         measured = truth @ poses.exp(rng.normal(size=6) * SIGMA)
         state = smoother.update(solve(smoother.predict(time_ns), measured))
@@ -348,7 +348,7 @@ def flown(plan: str, seed: int, settings: MotionSettings) -> tuple[list[float], 
     smoother, distances = FixedLagSmoother(settings), []
     wide = np.diag(np.r_[np.full(3, 0.05), np.full(3, 0.1), np.full(3, 0.7), np.full(3, 1.5)] ** 2)
     times_ns = np.rint(times_s * 1e9).astype(np.int64).tolist()
-    smoother.restart(Kinematics(times_ns[0], wTc[0], np.zeros(6), wide))
+    smoother.begin(Kinematics(times_ns[0], wTc[0], np.zeros(6), wide))
     for k in range(1, len(times_s) - 15):
         measured = wTc[k] @ poses.exp(rng.normal(size=6) * sigma)
         predicted = smoother.predict(times_ns[k])
