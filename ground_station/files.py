@@ -32,6 +32,19 @@ def check_outputs(*paths: str | Path | None, are_folders: bool = False) -> None:
             raise InputError(f"{path}: no permission to write in {folder}; name another place")
 
 
+def read_bytes(path: str | Path, most_bytes: int) -> bytes:
+    """What a file holds; raises `InputError` with one line, also where it is larger than that."""
+    path = Path(path)
+    with os_errors_as(path, InputError):
+        if path.exists() and not path.is_file():  # a device may have no end
+            raise InputError(f"{path}: not a file")
+        with path.open("rb") as file:
+            data = file.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise InputError(f"{path}: more than {most_bytes >> 20} MiB")
+    return data
+
+
 def write_bytes(path: str | Path, data: bytes) -> None:
     """Writes a file; raises `GroundStationError` with one line when the disk refuses."""
     path = Path(path)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ground_station.arrays import U8
 from ground_station.errors import InputError
+from ground_station.files import read_bytes
 from ground_station.geometry.camera import Camera
 from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
 from pi_firmware.wire.errors import os_errors_as
@@ -61,13 +62,7 @@ class ImageFolder:
 
 def read_grey(path: Path) -> U8:
     """An image file as (H, W) grey, as stored (no turning by EXIF); raises `InputError`."""
-    with os_errors_as(path, InputError):
-        if path.exists() and not path.is_file():  # a device may have no end
-            raise InputError(f"{path}: not a file")
-        with path.open("rb") as file:
-            data = file.read(_MOST_BYTES + 1)
-    if len(data) > _MOST_BYTES:
-        raise InputError(f"{path}: more than {_MOST_BYTES >> 20} MiB")
+    data = read_bytes(path, _MOST_BYTES)
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
     image = None
     if data and not _jpeg_is_cut(data):

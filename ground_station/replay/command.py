@@ -330,12 +330,14 @@ def text(result: Comparison) -> str:
 
 def document(result: Comparison, a: str, b: str) -> dict[str, Any]:
     """A comparison as plain values, every pair of frames in it."""
+    import msgspec
+
     frames_a, frames_b = result.a.frames, result.b.frames
     pairs = result.pairs
     return {
         "schema": "blimp.comparison/1",
-        "a": {"name": a, **dataclasses.asdict(result.a.run)},
-        "b": {"name": b, **dataclasses.asdict(result.b.run)},
+        "a": {"name": a, **msgspec.to_builtins(result.a.run)},
+        "b": {"name": b, **msgspec.to_builtins(result.b.run)},
         "identical": result.identical,
         "differing": result.first.count,
         "first_difference": {"time_ns": result.first.time_ns, "told": result.first.told},

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import msgspec
+
 from ground_station.evaluation.figures import Row
 from ground_station.files import write_bytes, write_json
 from ground_station.replay.cases.judge import Judged
@@ -133,5 +135,5 @@ def _document(case: Judged) -> dict[str, Any]:
         "seconds": case.seconds,
         "notes": case.notes,
         "rows": [asdict(row) for row in case.rows],
-        "outcome": None if outcome is None else asdict(outcome.run),
+        "outcome": None if outcome is None else msgspec.to_builtins(outcome.run),
     }

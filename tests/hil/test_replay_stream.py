@@ -103,7 +103,7 @@ def test_the_command_flies_live_and_writes_results_and_report(tmp_path: Path) ->
     assert outcome.truth is not None and outcome.floorplan is not None
     # Where the first search has landed, however busy the machine, no pose is wrong.
     assert measure.errors(outcome, outcome.truth).position_m.max(initial=0.0) < 0.25
-    for side in (outcome.side("payload"), outcome.side("ground")):
+    for side in (outcome.run.payload_side, outcome.run.ground_side):
         assert side.memory_MB is not None and side.memory_MB > 10
         assert side.cpu is not None and side.cpu > 0
 

@@ -16,6 +16,8 @@ from ground_station.localization.estimate import PoseEstimate, State
 from ground_station.replay.cases import frames
 from ground_station.replay.cases.outcome import Accounts, Outcome, Run
 from ground_station.replay.live import LiveFrame
+from ground_station.replay.resources import Side
+from pi_firmware.wire.messages import Battery, Health
 from pi_firmware.wire.recording import ESTIMATE_TOPIC, TRUTH_TOPIC, RecordingWriter
 
 SAMPLE = Path(__file__).parents[2] / "maps" / "atrium"
@@ -76,11 +78,11 @@ def outcome(rows: Sequence[LiveFrame] | None = None, **changes: Any) -> Outcome:
         "complete": True,
         "accounts": Accounts(**(counts | changes.pop("accounts", {}))),
         "stream": {"access_units": n},
-        "battery": {"time_ns": 1, "voltage": 3.9, "percentage": 0.7},
-        "health": {"time_ns": 1, "uptime_s": 3.0, "cpu": 0.2, "memory_MB": 60.0},
+        "battery": Battery(1, 3.9, percentage=0.7),
+        "health": Health(1, 3.0, cpu=0.2, memory_MB=60.0),
         "refused": 0,
-        "payload_side": {"memory_MB": 80.0, "cpu": 0.3, "source": "/proc"},
-        "ground_side": {"memory_MB": 300.0, "cpu": 0.9, "source": "/proc"},
+        "payload_side": Side(80.0, 0.3, "/proc"),
+        "ground_side": Side(300.0, 0.9, "/proc"),
         "settings": {"localizer": {"seed": 1}},
         "versions": {"ground_station": "0.1.0"},
     }

@@ -20,6 +20,7 @@ from ground_station.replay.cases import judge, page, pictures
 from ground_station.replay.cases.case import Limits
 from ground_station.replay.cases.compare import compare
 from ground_station.replay.cases.judge import Judged
+from ground_station.replay.cases.outcome import Outage
 from ground_station.replay.cases.truth import Reference
 
 HOSTILE = "<script>alert(1)</script>'\" onload=x \x07\u202eevil\udcff"
@@ -41,7 +42,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path
             versions={HOSTILE: HOSTILE},
             notes=[HOSTILE],
             accounts={"captured": 60, "sent": 60, "lost": 2},
-            outages=[{"begin_ns": begin_ns, "end_ns": begin_ns + 100_000_000, "name": HOSTILE}],
+            outages=[Outage(begin_ns, begin_ns + 100_000_000, HOSTILE)],
         ),
         floorplan=plan,
     )

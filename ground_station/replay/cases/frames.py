@@ -10,7 +10,7 @@ import hashlib
 import io
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from ground_station.arrays import F64, I64, Bools, Indices
 from ground_station.errors import InputError
-from ground_station.files import write_text
+from ground_station.files import read_bytes, write_text
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.localization.estimate import State
@@ -35,6 +35,8 @@ COLUMNS = (*_TIMES, "state", "reason", "relocalized", *_POSE, "pose_sha256")
 _MOST_BYTES = 256 << 20
 _FARTHEST_M = 1e7
 _STATES = tuple(state.value for state in State)
+_Row = tuple[list[int], tuple[str, str, bool, str], list[float]]
+"""Times, state with its reason, whether relocalized and the digest, and the pose."""
 
 
 @dataclass(frozen=True)
@@ -104,26 +106,16 @@ class Frames:
 
 def table(rows: Sequence[LiveFrame], captured_ns: Sequence[int]) -> Frames:
     """The table of some frames, and when each was captured by the ground's clock."""
-    estimates = [row.estimate for row in rows]
-    position, quaternion = np.full((len(rows), 3), np.nan), np.full((len(rows), 4), np.nan)
-    for k, estimate in enumerate(estimates):
-        if estimate.wTc is not None:
-            position[k] = estimate.wTc[:3, 3]
-            if np.isfinite(estimate.wTc).all():
-                quaternion[k] = poses.to_quaternion(estimate.wTc)
-    times = [
-        [row.sequence, row.estimate.time_ns, captured, row.arrival_ns, row.done_ns]
-        for row, captured in zip(rows, captured_ns, strict=True)
-    ]
-    return Frames(
-        **_columns(times),
-        state=tuple(estimate.state.value for estimate in estimates),
-        reason=tuple(estimate.reason for estimate in estimates),
-        relocalized=np.array([estimate.relocalized for estimate in estimates], dtype=bool),
-        position_m=position,
-        quaternion_xyzw=quaternion,
-        digest=tuple("" if e.wTc is None else digest(e.wTc) for e in estimates),
-    )
+    found = []
+    for row, captured in zip(rows, captured_ns, strict=True):
+        e, pose, code = row.estimate, [math.nan] * len(_POSE), ""
+        if e.wTc is not None:
+            pose[:3], code = e.wTc[:3, 3], digest(e.wTc)
+            if np.isfinite(e.wTc).all():
+                pose[3:] = poses.to_quaternion(e.wTc)
+        times = [row.sequence, e.time_ns, captured, row.arrival_ns, row.done_ns]
+        found.append((times, (e.state.value, e.reason, e.relocalized, code), pose))
+    return _of_rows(found)
 
 
 def digest(wTc: npt.ArrayLike) -> str:
@@ -149,17 +141,16 @@ def read_csv(path: str | Path) -> Frames:
     """Reads what `write_csv` wrote; raises `InputError` with one line that names the line."""
     path = Path(path)
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{path}: larger than {_MOST_BYTES >> 20} MiB")
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
+        text = read_bytes(path, _MOST_BYTES).decode()
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file") from None
     if text and not text.endswith("\n"):
         raise InputError(f"{path}: cut in the middle of its last line")
-    rows = _rows(path, text)
-    if next(rows, None) != list(COLUMNS):
+    try:
+        head, *rows = csv.reader(io.StringIO(text), strict=True) if text else [[]]
+    except csv.Error as error:
+        raise InputError(f"{path}: not CSV: {error}") from None
+    if head != list(COLUMNS):
         raise InputError(f"{path}, line 1: not the columns {','.join(COLUMNS)}")
     parsed = []
     for number, row in enumerate(rows, start=2):
@@ -167,32 +158,26 @@ def read_csv(path: str | Path) -> Frames:
             parsed.append(_parsed(row))
         except (ValueError, OverflowError) as error:
             raise InputError(f"{path}, line {number}: {str(error)[:100]!s}") from None
-    times, told, pose = zip(*parsed, strict=True) if parsed else ((), (), ())
+    return _of_rows(parsed)
+
+
+def _of_rows(rows: Sequence[_Row]) -> Frames:
+    times, told, pose = zip(*rows, strict=True) if rows else ((), (), ())
+    columns: Any = np.array(times, np.int64).reshape(-1, len(_TIMES)).T.copy()
     numbers = np.array(pose, np.float64).reshape(-1, len(_POSE))
+    state, reason, relocalized, code = zip(*told, strict=True) if rows else ((), (), (), ())
     return Frames(
-        **_columns(times),
-        state=tuple(t[0] for t in told),
-        reason=tuple(t[1] for t in told),
-        relocalized=np.array([t[2] for t in told], dtype=bool),
+        **dict(zip(_TIMES, columns, strict=True)),
+        state=state,
+        reason=reason,
+        relocalized=np.array(relocalized, dtype=bool),
         position_m=numbers[:, :3].copy(),
         quaternion_xyzw=numbers[:, 3:].copy(),
-        digest=tuple(t[3] for t in told),
+        digest=code,
     )
 
 
-def _columns(times: Sequence[Sequence[int]]) -> dict[str, Any]:
-    numbers = np.array(times, np.int64).reshape(-1, len(_TIMES))
-    return {name: numbers[:, k].copy() for k, name in enumerate(_TIMES)}
-
-
-def _rows(path: Path, text: str) -> Iterator[list[str]]:
-    try:
-        yield from csv.reader(io.StringIO(text), strict=True)
-    except csv.Error as error:
-        raise InputError(f"{path}: not CSV: {error}") from None
-
-
-def _parsed(row: list[str]) -> tuple[list[int], tuple[str, str, bool, str], list[float]]:
+def _parsed(row: list[str]) -> _Row:
     if len(row) != len(COLUMNS):
         raise ValueError(f"{len(row)} columns; {len(COLUMNS)} are needed")
     n = len(_TIMES)

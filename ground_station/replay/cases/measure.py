@@ -54,13 +54,16 @@ def figures(outcome: Outcome, reference: Reference | str | None) -> dict[str, Fi
 
     `reference` is what the poses are held against, None for nothing, or in words why there is none.
     """
+    battery = outcome.run.battery
     return {
         **_shares(outcome),
         **_errors(outcome, reference),
         **_latencies(outcome),
-        "recovery_s": recovery(outcome),
+        "recovery_s": _recovery(outcome),
         **_resources(outcome),
-        "battery_V": _battery(outcome),
+        "battery_V": Figure(battery.voltage, "its last message")
+        if battery
+        else Figure(None, "no battery message came"),
     }
 
 
@@ -129,53 +132,37 @@ def _latencies(outcome: Outcome) -> dict[str, Figure]:
     return {"latency_p50_ms": Figure(p50, told), "latency_p99_ms": Figure(p99, told)}
 
 
-def recoveries(outcome: Outcome) -> list[tuple[str, float | None]]:
-    """Of each outage or fault its name, and how long after its end (s) the first TRACKING pose was
-    there of a frame that was taken after it; None where none came.
+def _recovery(outcome: Outcome) -> Figure:
+    """How long after the end of an outage or fault (s) the first TRACKING pose was there of a frame
+    that was taken after it; of several the longest.
 
     Where the capture by the ground's clock is not known, the arrival stands in its place.
     """
+    if not outcome.run.outages:
+        return Figure(None, "nothing was out in this run")
     frames = outcome.frames
     taken_ns = np.where(frames.captured_ns == UNKNOWN, frames.arrival_ns, frames.captured_ns)
     good = frames.called(State.TRACKING.value) & frames.finite
-    found: list[tuple[str, float | None]] = []
-    for outage in outcome.outages:
+    never: list[str] = []
+    found: list[tuple[float, str]] = []
+    for outage in sorted(outcome.run.outages, key=lambda outage: outage.end_ns):
         after = good & (taken_ns >= outage.end_ns)
         done_ns = frames.done_ns[after]
-        took_s = float(done_ns.min() - outage.end_ns) / 1e9 if len(done_ns) else None
-        found.append((outage.name, took_s))
-    return found
-
-
-def recovery(outcome: Outcome) -> Figure:
-    """The longest of them."""
-    found = recoveries(outcome)
-    if not found:
-        return Figure(None, "nothing was out in this run")
-    never = [name for name, took_s in found if took_s is None]
+        if len(done_ns):
+            found.append((float(done_ns.min() - outage.end_ns) / 1e9, outage.name))
+        else:
+            never.append(outage.name)
     if never:
         return Figure(None, f"not TRACKING again after {', '.join(never)}")
-    worst_s, name = max((took_s, name) for name, took_s in found if took_s is not None)
+    worst_s, name = max(found)
     return Figure(worst_s, f"after {name}, the slowest of {len(found)}")
 
 
 def _resources(outcome: Outcome) -> dict[str, Figure]:
     found: dict[str, Figure] = {}
-    for name in ("payload", "ground"):
-        side = outcome.side(name)
+    for name, side in (("payload", outcome.run.payload_side), ("ground", outcome.run.ground_side)):
         values = {f"{name}_memory_MB": side.memory_MB, f"{name}_cpu": side.cpu}
         for key, value in values.items():
-            why = "nobody measured it"
-            found[key] = Figure(value, f"by {side.source}" if side.source else "")
-            if value is None or not np.isfinite(value) or value < 0:
-                found[key] = Figure(None, why)
+            told = f"by {side.source}" if side.source else ""
+            found[key] = Figure(value, "nobody measured it" if value is None else told)
     return found
-
-
-def _battery(outcome: Outcome) -> Figure:
-    volt = (outcome.run.battery or {}).get("voltage")
-    if volt is None:
-        return Figure(None, "no battery message came")
-    if isinstance(volt, bool) or not isinstance(volt, int | float) or not abs(volt) < 1e6:
-        return Figure(None, f"the voltage is {str(volt)[:24]!r}")
-    return Figure(float(volt), "its last message")

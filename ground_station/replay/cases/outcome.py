@@ -7,98 +7,98 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Final, Literal
 
 import cv2
 import msgspec
 import yaml
+from msgspec import Meta
 
 from ground_station.errors import InputError
-from ground_station.files import write_bytes, write_json, write_text
+from ground_station.files import read_bytes, write_bytes, write_json, write_text
 from ground_station.geometry.trajectory import Trajectory, read_tum, write_tum
 from ground_station.map.floorplan import FloorPlan, load_floorplan
 from ground_station.map.observations import landmarks_sha256
 from ground_station.map.store import Map
 from ground_station.replay.cases.frames import Frames, read_csv, write_csv
 from ground_station.replay.resources import Side
-from pi_firmware.wire import config
-from pi_firmware.wire.config import key, table
+from pi_firmware.wire.config import key
+from pi_firmware.wire.errors import os_errors_as
+from pi_firmware.wire.messages import Battery, Health
 
-SCHEMA = "blimp.outcome/1"
+SCHEMA: Final = "blimp.outcome/1"
 RESULT, FRAMES, ESTIMATE, TRUTH = "result.json", "frames.csv", "estimate.txt", "truth.txt"
 FLOORPLAN, PICTURE = "floorplan.yaml", "floorplan.png"
 _MOST_BYTES = 16 << 20
 
 
-def _count(doc: str) -> Any:
-    """A number of frames; one that is reckoned may come out negative, and is then told."""
-    return key(0, doc, low=-(2**53), high=2**53)
+Count = Annotated[int, Meta(ge=-(2**53), le=2**53)]
+"""Of frames; one that is reckoned may come out negative, and is then told."""
+TimeNs = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 
 
 @dataclass(frozen=True)
 class Accounts:
     """Frames by what became of them, as `LiveResult.accounts` names them."""
 
-    captured: int = _count("taken by the camera")
-    gated: int = _count("held back by the payload: too little to see in them")
-    discarded: int = _count("passed the gate, but never left the payload")
-    sent: int = _count("left the payload over the radio")
-    received: int = _count("arrived whole at the ground station")
-    lost: int = _count("sent, but never arrived whole")
-    dropped: int = _count("arrived, but skipped because newer ones were waiting")
-    localized: int = _count("solved from what is seen in them")
+    captured: Count = key(0, "taken by the camera")
+    gated: Count = key(0, "held back by the payload: too little to see in them")
+    discarded: Count = key(0, "passed the gate, but never left the payload")
+    sent: Count = key(0, "left the payload over the radio")
+    received: Count = key(0, "arrived whole at the ground station")
+    lost: Count = key(0, "sent, but never arrived whole")
+    dropped: Count = key(0, "arrived, but skipped because newer ones were waiting")
+    localized: Count = key(0, "solved from what is seen in them")
 
 
 @dataclass(frozen=True)
 class Outage:
     """When nothing came through, or a fault lasted: by the ground's wall clock."""
 
-    begin_ns: int = key(0, "its begin", unit="ns", low=0, high=2**63 - 1)
-    end_ns: int = key(0, "its end", unit="ns", low=0, high=2**63 - 1)
-    name: str = key("outage", "what it was")
+    begin_ns: TimeNs = 0
+    end_ns: TimeNs = 0
+    name: str = "outage"
 
 
-@dataclass(frozen=True)
-class Run:
+class Run(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Everything of a run but its frames; what is not known is absent or None.
 
-    `battery` and `health` are the payload's last messages as they came; `refused` counts messages
-    that were not as agreed, as one with a NaN is not. `settings` is nested plain values.
+    `battery` and `health` are the payload's last messages; `refused` counts messages that were not
+    as agreed, as one with a NaN is not. `settings` is nested plain values.
     """
 
-    schema: str = key(SCHEMA, "this file's kind", choices=(SCHEMA,))
-    title: str = key("", "what was flown")
-    case: str = key("", "the case's name")
-    payload: str = key("process", "process, image or ssh")
-    link: str = key("loopback", "what carried the video")
-    recording: str = key("", "the flight's file")
-    map: str = key("", "the map's name")
-    map_sha256: str = key("", "of its landmarks, descriptors and positions")
-    preset: str = key("default", "the localizer's settings")
-    init: str = key("none", "the first frame's pose")
-    stepped: bool = key(False, "whether no clock decided anything")
-    rate_hz: float = key(0.0, "frames captured a second", unit="Hz")
-    seed: int = key(0, "the localizer's")
-    began: str = key("", "when, ISO 8601")
-    seconds: float = key(0.0, "how long it took", unit="s", low=0.0)
-    complete: bool = key(False, "whether the payload's final counts came")
-    accounts: Accounts = table(Accounts)
-    stream: dict[str, Any] = key({}, "the receiver's counters")
-    link_counts: dict[str, Any] = key({}, "what the link did to packets")
-    clock_offset: dict[str, Any] | None = key(None, "the payload's clock")
-    outages: list[dict[str, Any]] = key([], "each an `Outage`")
-    battery: dict[str, Any] | None = key(None, "the last message")
-    health: dict[str, Any] | None = key(None, "the last message")
-    refused: int | None = key(None, "messages that were not as agreed", low=0, high=2**53)
-    payload_side: dict[str, Any] = key({}, "a `Side`")
-    ground_side: dict[str, Any] = key({}, "a `Side`")
-    versions: dict[str, Any] = key({}, "of programs")
-    settings: dict[str, Any] = key({}, "of localizer and firmware")
-    notes: list[str] = key([], "what a reader must know")
+    schema: Literal["blimp.outcome/1"] = SCHEMA
+    title: str = ""
+    case: str = ""
+    payload: str = "process"  # or image, or ssh
+    link: str = "loopback"  # what carried the video
+    recording: str = ""
+    map: str = ""
+    map_sha256: str = ""  # of its landmarks, descriptors and positions
+    preset: str = "default"
+    init: str = "none"
+    stepped: bool = False
+    rate_hz: float = 0.0
+    seed: int = 0  # the localizer's
+    began: str = ""  # ISO 8601
+    seconds: float = 0.0  # it took
+    complete: bool = False  # whether the payload's final counts came
+    accounts: Accounts = Accounts()
+    stream: dict[str, Any] = {}  # the receiver's counters
+    link_counts: dict[str, Any] = {}  # what the link did to packets
+    clock_offset: dict[str, Any] | None = None  # of the payload's clock
+    outages: list[Outage] = []
+    battery: Battery | None = None
+    health: Health | None = None
+    refused: Count | None = None
+    payload_side: Side = Side()
+    ground_side: Side = Side()
+    versions: dict[str, Any] = {}  # of programs
+    settings: dict[str, Any] = {}  # of localizer and firmware
+    notes: list[str] = []  # what a reader must know
 
 
 @dataclass(frozen=True)
@@ -116,18 +116,6 @@ class Outcome:
         """Its poses by capture time."""
         return self.frames.trajectory()
 
-    @property
-    def outages(self) -> list[Outage]:
-        """In order of time; raises `ConfigError` for one that is not as agreed."""
-        found = [config.from_mapping(item, Outage, where=RESULT) for item in self.run.outages]
-        return sorted(found, key=lambda outage: outage.end_ns)
-
-    def side(self, name: str) -> Side:
-        """The resources of `payload` or `ground`; raises `ConfigError`."""
-        told = getattr(self.run, f"{name}_side")
-        known = {k: v for k, v in told.items() if v is not None}
-        return config.from_mapping(known, Side, where=f"{RESULT}: {name}_side")
-
 
 def map_sha256(map_: Map) -> str:
     """Of a map's landmarks with their descriptors and where they are: another one, other poses."""
@@ -139,26 +127,24 @@ def map_sha256(map_: Map) -> str:
 def write_outcome(folder: str | Path, outcome: Outcome) -> None:
     """Writes the folder again; raises `GroundStationError` when the disk refuses."""
     folder = Path(folder)
-    try:
+    with os_errors_as(folder, InputError):
         folder.mkdir(parents=True, exist_ok=True)
         for name in (RESULT, TRUTH, FLOORPLAN):
             (folder / name).unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: {error.strerror or error}") from None
     write_csv(folder / FRAMES, outcome.frames)
     write_tum(folder / ESTIMATE, outcome.estimate)
     if outcome.truth is not None:
         write_tum(folder / TRUTH, outcome.truth)
     if outcome.floorplan is not None:
         _write_floorplan(folder, outcome.floorplan)
-    document = {k: v for k, v in dataclasses.asdict(outcome.run).items() if v is not None}
+    document = {k: v for k, v in msgspec.to_builtins(outcome.run).items() if v is not None}
     write_json(folder / RESULT, document)
 
 
 def read_outcome(folder: str | Path) -> Outcome:
     """Reads a run's folder, or what `blimp replay` wrote around one.
 
-    Raises `InputError`, `ConfigError` or `GeometryError` with one line.
+    Raises `InputError` or `GeometryError` with one line.
     """
     folder = Path(folder)
     inner = folder / "outcome"
@@ -167,31 +153,23 @@ def read_outcome(folder: str | Path) -> Outcome:
     run = _read_run(folder / RESULT)
     plan = folder / FLOORPLAN
     truth = folder / TRUTH
-    outcome = Outcome(
+    return Outcome(
         run,
         read_csv(folder / FRAMES),
         read_tum(truth) if truth.is_file() else None,
         load_floorplan(plan) if plan.is_file() else None,
         folder,
     )
-    # Told now and by name, not when a figure is taken.
-    _ = outcome.outages, outcome.side("payload"), outcome.side("ground")
-    return outcome
 
 
 def _read_run(path: Path) -> Run:
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{path}: larger than {_MOST_BYTES >> 20} MiB")
-        document = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
-    except FileNotFoundError:
+    if not path.is_file():
         made = f"blimp replay RECORDING --map MAP --out {path.parent}"
-        raise InputError(f"{path.parent}: no run's outcome is there; {made} writes one") from None
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
-    except (msgspec.DecodeError, RecursionError):
-        raise InputError(f"{path}: not a JSON object") from None
-    return config.from_mapping(document, Run, where=str(path))
+        raise InputError(f"{path.parent}: no run's outcome is there; {made} writes one")
+    try:
+        return msgspec.json.decode(read_bytes(path, _MOST_BYTES), type=Run)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise InputError(f"{path}: not a run's result: {error}") from None
 
 
 def _write_floorplan(folder: Path, plan: FloorPlan) -> None:

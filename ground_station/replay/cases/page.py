@@ -229,4 +229,6 @@ def _outages_s(outcome: Outcome, start_ns: int) -> list[tuple[float, float]]:
     if not known.any():
         return []
     ahead_ns = int(np.median((frames.captured_ns - frames.time_ns)[known])) + start_ns
-    return [((o.begin_ns - ahead_ns) / 1e9, (o.end_ns - ahead_ns) / 1e9) for o in outcome.outages]
+    return [
+        ((o.begin_ns - ahead_ns) / 1e9, (o.end_ns - ahead_ns) / 1e9) for o in outcome.run.outages
+    ]

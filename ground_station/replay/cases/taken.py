@@ -57,12 +57,12 @@ def outcome_of(
         accounts=Accounts(**live.accounts()),
         stream=live.payload.stream,
         clock_offset=live.clock,
-        outages=[dataclasses.asdict(outage) for outage in outages],
-        battery=_document(live.payload.battery),
-        health=_document(health),
+        outages=list(outages),
+        battery=live.payload.battery,
+        health=health,
         refused=live.payload.refused,
-        payload_side=dataclasses.asdict(payload_side or Side()),
-        ground_side=dataclasses.asdict(result.ground_side),
+        payload_side=payload_side or Side(),
+        ground_side=result.ground_side,
         versions=versions() | _firmware_version(health),
         settings={
             "replay": _plain(dataclasses.asdict(settings), without=("recording", "pictures")),
@@ -86,10 +86,6 @@ def floorplan_of(map_: Map) -> FloorPlan | None:
     """The plan in a map's folder, where it has one."""
     path = None if map_.folder is None else map_.folder / "floorplan.yaml"
     return load_floorplan(path) if path is not None and path.is_file() else None
-
-
-def _document(message: messages.Message | None) -> dict[str, Any] | None:
-    return None if message is None else dataclasses.asdict(message)
 
 
 def _firmware_version(health: messages.Health | None) -> dict[str, str]:
