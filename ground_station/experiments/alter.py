@@ -12,6 +12,7 @@ import numpy as np
 from ground_station.arrays import U8, Bools, Indices
 from ground_station.experiments.declaration import Alteration
 from ground_station.geometry.camera import Camera
+from ground_station.geometry.resizing import scaled
 from ground_station.map.descriptors import Descriptors
 from ground_station.map.store import Landmarks, Map, MapInfo
 from ground_station.recording.frames import Frame
@@ -62,23 +63,10 @@ def scaled_size(width_px: int, height_px: int, scale: float) -> tuple[int, int]:
 
 
 def scaled_camera(camera: Camera, scale: float) -> Camera:
-    """The camera of pictures at that scale; pixel centres are whole numbers, so half a pixel moves.
-
-    The lens acts on the plane z = 1, which does not change.
-    """
+    """The camera of pictures at that scale."""
     if scale >= 1:
         return camera
-    width, height = scaled_size(camera.width_px, camera.height_px, scale)
-    sx, sy = width / camera.width_px, height / camera.height_px
-    return replace(
-        camera,
-        width_px=width,
-        height_px=height,
-        fx_px=camera.fx_px * sx,
-        fy_px=camera.fy_px * sy,
-        cx_px=(camera.cx_px + 0.5) * sx - 0.5,
-        cy_px=(camera.cy_px + 0.5) * sy - 0.5,
-    )
+    return scaled(camera, *scaled_size(camera.width_px, camera.height_px, scale))
 
 
 def arrivals(units: Iterable[bytes], packet_loss: float, seed: int) -> Bools:
