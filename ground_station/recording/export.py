@@ -12,6 +12,7 @@ import numpy as np
 from ground_station.errors import GroundStationError, InputError
 from ground_station.geometry.trajectory import tum_line
 from pi_firmware.wire import files
+from pi_firmware.wire.errors import os_errors_as
 from pi_firmware.wire.recording import ESTIMATE_TOPIC, PoseSample, RecordingReader, RecordingWriter
 
 HEADER = "# timestamp tx ty tz qx qy qz qw\n"
@@ -74,15 +75,16 @@ def tum(poses: Poses) -> Iterator[str]:
 def write_mcap(path: str | Path, poses: Poses, source: str) -> None:
     """Writes the poses alone as a recording, beside and renamed; `source` names where from."""
     path = Path(path)
-    try:
-        with files.replacing(path) as part, RecordingWriter(part) as writer:
-            writer.write_metadata("export", {"source": source, "topic": poses.topic})
-            for sample in poses.samples:
-                writer.write_pose(
-                    sample.time_ns, sample.position_m, sample.quaternion_xyzw, topic=poses.topic
-                )
-    except OSError as error:
-        raise GroundStationError(f"{path}: {error.strerror or error}") from None
+    with (
+        os_errors_as(path, GroundStationError),
+        files.replacing(path) as part,
+        RecordingWriter(part) as writer,
+    ):
+        writer.write_metadata("export", {"source": source, "topic": poses.topic})
+        for sample in poses.samples:
+            writer.write_pose(
+                sample.time_ns, sample.position_m, sample.quaternion_xyzw, topic=poses.topic
+            )
 
 
 def _only_topic(path: str | Path, topics: Iterable[str]) -> str:

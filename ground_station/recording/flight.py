@@ -29,6 +29,7 @@ from pi_firmware.wire.recording import (
     TRUTH_TOPIC,
     VIDEO_TOPIC,
     RecordingReader,
+    RecordingWriter,
     VideoSample,
 )
 
@@ -177,6 +178,19 @@ def camera_of(reader: RecordingReader) -> Camera | None:
         "model": model,
     }
     return config.from_mapping(values, Camera, where=f"{reader.path}: calibration")
+
+
+def write_camera(writer: RecordingWriter, camera: Camera, time_ns: int) -> None:
+    """Writes what `camera_of` reads: the calibration, and the camera's numbers as metadata."""
+    writer.write_metadata(CAMERA_TABLE, {k: str(v) for k, v in camera.as_dict().items()})
+    writer.write_calibration(
+        time_ns,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        matrix=camera.matrix.ravel().tolist(),
+        distortion=camera.distortion.tolist(),
+        distortion_model=camera.distortion_model,
+    )
 
 
 def trajectory_of(

@@ -9,9 +9,11 @@ from pathlib import Path
 from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.resizing import misfit
-from ground_station.recording.frames import CAMERA_TABLE, FrameSource
+from ground_station.recording.flight import write_camera
+from ground_station.recording.frames import FrameSource
 from ground_station.recording.h264 import H264Encoder
 from pi_firmware.wire import files
+from pi_firmware.wire.errors import os_errors_as
 from pi_firmware.wire.recording import RecordingWriter
 
 IDR_NS = 1_000_000_000
@@ -47,31 +49,24 @@ def import_frames(
     times_ns: list[int] = []
     idr_ns = first.time_ns
     path = Path(path)
-    try:
-        with files.replacing(path) as part, RecordingWriter(part) as writer:
-            writer.write_metadata(CAMERA_TABLE, {k: str(v) for k, v in camera.as_dict().items()})
-            writer.write_metadata("import", {"source": name})
-            writer.write_calibration(
-                first.time_ns,
-                width_px=width,
-                height_px=height,
-                matrix=camera.matrix.ravel().tolist(),
-                distortion=camera.distortion.tolist(),
-                distortion_model=camera.distortion_model,
-            )
-            for frame in itertools.chain([first], frames):
-                if frame.image.shape != (height, width):
-                    fit = misfit(camera, frame.image.shape[1], frame.image.shape[0])
-                    raise InputError(f"{name}: {frame.name} has {fit}")
-                # Where the next one, after as long as this one, would come too late.
-                is_idr = not times_ns or 2 * frame.time_ns - times_ns[-1] - idr_ns > IDR_NS
-                idr_ns = frame.time_ns if is_idr else idr_ns
-                times_ns.append(frame.time_ns)
-                for index, data in encoder.encode(frame.image, idr=is_idr):
-                    writer.write_video(times_ns[index], data)
-                step()
-            for index, data in encoder.finish():
+    with (
+        os_errors_as(path, InputError),
+        files.replacing(path) as part,
+        RecordingWriter(part) as writer,
+    ):
+        write_camera(writer, camera, first.time_ns)
+        writer.write_metadata("import", {"source": name})
+        for frame in itertools.chain([first], frames):
+            if frame.image.shape != (height, width):
+                fit = misfit(camera, frame.image.shape[1], frame.image.shape[0])
+                raise InputError(f"{name}: {frame.name} has {fit}")
+            # Where the next one, after as long as this one, would come too late.
+            is_idr = not times_ns or 2 * frame.time_ns - times_ns[-1] - idr_ns > IDR_NS
+            idr_ns = frame.time_ns if is_idr else idr_ns
+            times_ns.append(frame.time_ns)
+            for index, data in encoder.encode(frame.image, idr=is_idr):
                 writer.write_video(times_ns[index], data)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
+            step()
+        for index, data in encoder.finish():
+            writer.write_video(times_ns[index], data)
     return len(times_ns)

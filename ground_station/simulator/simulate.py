@@ -19,6 +19,7 @@ from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.progress import stop_noted
+from ground_station.recording.flight import write_camera
 from ground_station.recording.h264 import H264Encoder
 from ground_station.simulator import board, dynamics, handheld, people, scenes
 from ground_station.simulator.imaging import (
@@ -320,7 +321,7 @@ def _write_head(
     writer: RecordingWriter, settings: SimulationSettings, flight: SimulatedFlight, first_ns: int
 ) -> None:
     camera = flight.carried
-    writer.write_metadata("camera", {k: str(v) for k, v in camera.as_dict().items()})
+    write_camera(writer, camera, first_ns)
     writer.write_metadata(
         "simulation",
         {
@@ -347,11 +348,3 @@ def _write_head(
     if settings.lens_error:
         taken_with = {k: str(v) for k, v in flight.camera.as_dict().items()}
         writer.write_metadata("true_camera", taken_with)
-    writer.write_calibration(
-        first_ns,
-        width_px=camera.width_px,
-        height_px=camera.height_px,
-        matrix=camera.matrix.ravel().tolist(),
-        distortion=camera.distortion.tolist(),
-        distortion_model=camera.distortion_model,
-    )

@@ -40,7 +40,7 @@ from ground_station.replay.cases.source import Source, check_start, examine, mis
 from ground_station.replay.cases.truth import Reference
 from pi_firmware.wire import config, files
 from pi_firmware.wire.config import range_of
-from pi_firmware.wire.errors import BlimpError
+from pi_firmware.wire.errors import BlimpError, os_errors_as
 from pi_firmware.wire.recording import (
     CALIBRATION_TOPIC,
     ESTIMATE_TOPIC,
@@ -314,7 +314,7 @@ def extract(source: str | Path, prefix: str, path: str | Path) -> int:
     wanted = {prefix + topic: topic for topic in (*_KINDS, FRAME_INFO_TOPIC)}
     frames = 0
     try:
-        with files.replacing(path) as part:
+        with os_errors_as(path, InputError), files.replacing(path) as part:
             with RecordingWriter(part) as writer:
                 for channel, record in reader.messages(set(wanted)):
                     _copy(writer, wanted[channel.topic], record.log_time, record.data)
@@ -326,8 +326,6 @@ def extract(source: str | Path, prefix: str, path: str | Path) -> int:
                 raise InputError(f"{source}: no video on {prefix}{VIDEO_TOPIC}")
     except DecodeError:
         raise InputError(f"{source}: a message is not what its topic says") from None
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from None
     return frames
 
 
