@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
@@ -136,14 +137,13 @@ def tum_line(time_ns: int, position_m: Iterable[float], quaternion_xyzw: Iterabl
     return f"{sign}{s}.{ns:09d} {numbers}"
 
 
-def write_tum(path: str | Path, trajectory: Trajectory) -> None:
-    """Writes a TUM text file, beside and renamed."""
-    lines = ["# timestamp tx ty tz qx qy qz qw"]
-    for time_ns, p, q in zip(
+def write_tum(path: str | Path, trajectory: Trajectory, comments: Sequence[str] = ()) -> None:
+    """Writes a TUM text file, beside and renamed, with `comments` as its first lines."""
+    poses = zip(
         trajectory.time_ns.tolist(),
         trajectory.position_m,
         trajectory.quaternion_xyzw,
         strict=True,
-    ):
-        lines.append(tum_line(time_ns, p, q))
+    )
+    lines = [*comments, "# timestamp tx ty tz qx qy qz qw", *starmap(tum_line, poses)]
     write_text(path, "\n".join(lines) + "\n")

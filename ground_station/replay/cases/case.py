@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -181,18 +181,16 @@ class Link:
                     " before it ends"
                 )
             end_s = sum(outage)
-        if self.kind == LOOPBACK and (changed := self._changed()):
+        if self.kind == LOOPBACK and (changed := self.changed()):
             raise ValueError(
                 f"'link.{changed[0]}' is set, but 'link.kind' is 'loopback', which impairs nothing;"
                 " allowed: 'proxy', 'namespace'"
             )
 
-    def _changed(self) -> list[str]:
-        usual = {"kind": LOOPBACK, "seed": self.seed}
-        for item in dataclasses.fields(self):
-            made = item.default_factory
-            usual.setdefault(item.name, made() if callable(made) else item.default)
-        return [name for name, value in usual.items() if getattr(self, name) != value]
+    def changed(self) -> list[str]:
+        """The names of what it does to packets."""
+        usual = asdict(Link(kind=PROXY)) | {"kind": self.kind, "seed": self.seed}
+        return [name for name, value in asdict(self).items() if value != usual[name]]
 
 
 @dataclass(frozen=True)

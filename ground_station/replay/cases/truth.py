@@ -14,8 +14,7 @@ from pathlib import Path
 import tomli_w
 
 from ground_station.errors import InputError
-from ground_station.files import write_text
-from ground_station.geometry.trajectory import Trajectory, read_tum, tum_line
+from ground_station.geometry.trajectory import Trajectory, read_tum, write_tum
 from ground_station.recording.flight import trajectory_of
 from ground_station.replay.cases.case import GOLDEN, NONE, RECORDING, Case
 from ground_station.replay.cases.outcome import Outcome
@@ -102,14 +101,8 @@ def accept(
 def write_golden(path: str | Path, golden: Golden) -> None:
     """Writes the file, beside and renamed."""
     terms = tomli_w.dumps(asdict(golden.accepted)).splitlines()
-    lines = [f"# A run that was {golden}.", *((MARK + line).rstrip() for line in terms)]
-    lines.append("# timestamp tx ty tz qx qy qz qw")
-    poses = golden.poses
-    for time_ns, p, q in zip(
-        poses.time_ns.tolist(), poses.position_m, poses.quaternion_xyzw, strict=True
-    ):
-        lines.append(tum_line(time_ns, p, q))
-    write_text(path, "\n".join(lines) + "\n")
+    comments = [f"# A run that was {golden}.", *((MARK + line).rstrip() for line in terms)]
+    write_tum(path, golden.poses, comments)
 
 
 def read_golden(path: str | Path) -> Golden:

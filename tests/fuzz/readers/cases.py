@@ -50,7 +50,8 @@ _ROW = ",".join(["1", "2", "3", "4", "5", "TRACKING", "", "0", *["0.5"] * 7, "0"
 _RUN = {
     "schema": SCHEMA, "title": "a run", "rate_hz": 10.0, "seed": 1, "stream": {"packets": 5},
     "outages": [{"begin_ns": 1, "end_ns": 2}], "battery": {"time_ns": 1, "voltage": 3.9},
-    "payload_side": {}, "ground_side": {}, "settings": {"a": {"b": 1}}, "notes": ["a note"], "accounts": {},
+    "payload_side": {}, "ground_side": {}, "settings": {"a": {"b": 1}}, "notes": ["a note"],
+    "accounts": {},
 }  # fmt: skip
 
 

@@ -68,10 +68,5 @@ class ProxyLink:
 
 def told(link: Link) -> str:
     """A link's settings that differ from a clean one's, with the seed."""
-    usual = Link(kind=link.kind, seed=link.seed)
-    changed = [
-        f"{field.name}={getattr(link, field.name)}"
-        for field in dataclasses.fields(Link)
-        if getattr(link, field.name) != getattr(usual, field.name)
-    ]
+    changed = [f"{name}={getattr(link, name)}" for name in link.changed()]
     return f"{link.kind}, seed {link.seed}: {', '.join(changed) or 'clean'}"
