@@ -143,6 +143,10 @@ def write_report(path: Path, report: FlightReport) -> None:
         _TEMPLATE,
         title=report.title,
         report=report,
+        bound_rows=[
+            (b.name, b.measured, b.allowed, "✓ met" if b.holds else "✗ missed")
+            for b in report.bounds
+        ],
         frame_rows=_frame_rows(document["frames"]),
         ate_rows=_ate_rows(document["ate"] or {}),
         time_rows=_time_rows(document),
@@ -153,7 +157,10 @@ def write_report(path: Path, report: FlightReport) -> None:
             rotation_deg=limits.get(ROTATION),
         ),
         pictures=[(_jpeg(image), caption) for image, caption in report.pictures],
-        settings=flat(report.settings),
+        settings=[
+            *((f"seed: {name}", seed) for name, seed in report.seeds.items()),
+            *flat(report.settings).items(),
+        ],
         legend=_LEGEND,
     )
 

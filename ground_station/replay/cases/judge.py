@@ -46,6 +46,13 @@ class Judged:
         return [row for row in self.rows if row.holds is False]
 
     @property
+    def told(self) -> list[tuple[str, str, str, str]]:
+        """Rows for a person: name, measured, allowed, and whether it holds; misses first."""
+        marks = {False: "✗ ", True: "✓ ", None: ""}
+        rows = sorted(self.rows, key=lambda row: list(marks).index(row.holds))
+        return [(r.name, r.measured, r.allowed, f"{marks[r.holds]}{r.told}".strip()) for r in rows]
+
+    @property
     def passed(self) -> bool:
         """False for an error; a case that was skipped has neither passed nor failed: True."""
         return not self.error and not self.missed

@@ -24,16 +24,24 @@ _TEMPLATES = Path(__file__).parent / "templates"
 def write_comparison(path: str | Path, comparison: Comparison, a: str, b: str) -> None:
     """Writes the page of two runs; `a` and `b` are their names."""
     c = comparison
+    counts = {
+        name: (count, getattr(c.b.run.accounts, name))
+        for name, count in asdict(c.a.run.accounts).items()
+    }
     write_page(
         path,
         _TEMPLATES / "compare.html",
         title=f"{b} against {a}",
         names=(a, b),
         comparison=c,
-        lines=[(line, *cells(line)) for line in c.lines],
-        accounts=[
-            (name, value, asdict(c.b.run.accounts)[name])
-            for name, value in asdict(c.a.run.accounts).items()
+        lines=[
+            (line.name, a_, b_, line.unit, *more, ("✗ " if line.fails else "") + line.told)
+            for line in c.lines
+            for a_, b_, *more in [cells(line)]
+        ],
+        counts=[
+            (name, *both, f"{both[1] - both[0]:+d}" if both[0] != both[1] else "")
+            for name, both in (counts | c.states).items()
         ],
         shown=_of_comparison(c),
     )
