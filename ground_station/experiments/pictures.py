@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import itertools
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -69,15 +70,11 @@ def paths(cases: Sequence[dict[str, Any]], plan: FloorPlan | None, theme: Theme)
 def over_time(cases: Sequence[dict[str, Any]], theme: Theme) -> Figure:
     """Position error of each case's first seed over time: thesis dashed, alone dotted."""
     figure, (axes,) = figure_of((8.0, 3.2), theme, label_size=8)
-    for hue, case in zip(_hues(len(cases)), cases, strict=True):
-        for preset, style in _STYLES.items():
-            series = first_series(case, preset)
-            if not series:
-                continue
+    for case, preset, look in _lines(cases):
+        if series := first_series(case, preset):
             t, e = broken(series["time_s"], 100 * np.asarray(series["position_m"]))
-            label = str(case["title"]) if preset == "default" else None
-            axes.plot(t, e, style, color=hue, linewidth=1.0, label=label)
-    _logarithmic(axes, y=True)
+            axes.plot(t, e, linewidth=1.0, **look)
+    _logarithmic(axes, "y")
     axes.set_xlabel("time, s")
     axes.set_ylabel("position error, cm")
     legend(axes, theme, loc="best", fontsize=8)
@@ -90,19 +87,14 @@ def distribution(cases: Sequence[dict[str, Any]], theme: Theme) -> Figure:
     Frames that were not localized count: a line that ends below 1 has lost the rest.
     """
     figure, (axes,) = figure_of((8.0, 3.4), theme, label_size=8)
-    for hue, case in zip(_hues(len(cases)), cases, strict=True):
-        for preset, style in _STYLES.items():
-            runs = [r for r in case["presets"].get(preset, {}).get("runs", []) if "failed" not in r]
-            errors = np.sort([e for run in runs for e in run["series"].get("position_m", [])])
-            frames = sum(run["frames"] for run in runs)
-            if not len(errors):
-                continue
-            label = str(case["title"]) if preset == "default" else None
-            axes.step(
-                100 * np.maximum(errors, 1e-4), np.arange(1, len(errors) + 1) / frames, style,
-                where="post", color=hue, linewidth=1.2, label=label,
-            )  # fmt: skip
-    _logarithmic(axes, y=False)
+    for case, preset, look in _lines(cases):
+        runs = [r for r in case["presets"].get(preset, {}).get("runs", []) if "failed" not in r]
+        errors = np.sort([e for run in runs for e in run["series"].get("position_m", [])])
+        if len(errors):
+            share = np.arange(1, len(errors) + 1) / sum(run["frames"] for run in runs)
+            errors_cm = 100 * np.maximum(errors, 1e-4)
+            axes.step(errors_cm, share, where="post", linewidth=1.2, **look)
+    _logarithmic(axes, "x")
     axes.set_ylim(0, 1.02)
     axes.set_xlabel("position error, cm")
     axes.set_ylabel("share of frames")
@@ -126,7 +118,7 @@ def sweep(cases: Sequence[dict[str, Any]], level: str, theme: Theme) -> Figure:
         )  # fmt: skip
         share = [np.nan if row.get("localized") is None else row["localized"] for row in found]
         lower.plot(places, 100 * np.asarray(share), "o" + style, color=hue, markersize=4, lw=1.2)
-    _logarithmic(upper, y=True)
+    _logarithmic(upper, "y")
     upper.set_ylabel("position error, cm")
     lower.set_ylabel("localized, %")
     lower.set_ylim(0, 104)
@@ -152,13 +144,10 @@ def first_series(case: dict[str, Any], preset: str) -> dict[str, list[float]]:
     return {}
 
 
-def _logarithmic(axes: Axes, *, y: bool) -> None:
+def _logarithmic(axes: Axes, name: Literal["x", "y"]) -> None:
     """A logarithmic axis with plain numbers: nobody reads 6 x 10^0 centimetres."""
-    if y:
-        axes.set_yscale("log")
-    else:
-        axes.set_xscale("log")
-    axis = axes.yaxis if y else axes.xaxis
+    axes.set(**{f"{name}scale": "log"})
+    axis = axes.yaxis if name == "y" else axes.xaxis
     plain = FuncFormatter(lambda value, _: f"{value:g}")
     axis.set_major_formatter(plain)
     axis.set_minor_locator(LogLocator(subs=(2.0, 5.0)))
@@ -170,5 +159,9 @@ def _value(found: dict[str, float] | None, key: str) -> float:
     return float("nan") if found is None else found[key]
 
 
-def _hues(count: int) -> list[str]:
-    return [_HUES[k % len(_HUES)] for k in range(count)]
+def _lines(cases: Sequence[dict[str, Any]]) -> Iterator[tuple[dict[str, Any], str, dict[str, Any]]]:
+    """Each case and preset, and its line's colour, style and, of the default, label."""
+    for hue, case in zip(itertools.cycle(_HUES), cases, strict=False):
+        for preset, style in _STYLES.items():
+            label = str(case["title"]) if preset == "default" else None
+            yield case, preset, {"color": hue, "linestyle": style, "label": label}

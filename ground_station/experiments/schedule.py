@@ -51,32 +51,25 @@ def work(job: Job, folder: Path, data: Path) -> None:
     """
     store = Store(folder)
     try:
-        if isinstance(job, LensJob):
-            _calibrate(job, store)
-        elif isinstance(job, FlightJob):
-            _fly(job, store)
-        elif isinstance(job, MapJob):
+        if isinstance(job, MapJob):
             _build(job, store, data)
-        else:
+        elif isinstance(job, RunJob):
             _run(job, store, data)
+        else:
+            _film(job, store.flight(job.name))
     except (MapError, CalibrationError) as error:
         store.write(job.key, {"failed": str(error)})
 
 
-def _calibrate(job: LensJob, store: Store) -> None:
+def _film(job: LensJob | FlightJob, path: Path) -> None:
+    from ground_station.experiments.flights import fly
     from ground_station.experiments.lenses import find
 
-    path = store.flight(job.name)
     path.parent.mkdir(parents=True, exist_ok=True)
-    find(job.camera, job.processing, job.seed, path)
-
-
-def _fly(job: FlightJob, store: Store) -> None:
-    from ground_station.experiments.flights import fly
-
-    path = store.flight(job.name)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    fly(job.flight, job.seed, path)
+    if isinstance(job, FlightJob):
+        fly(job.flight, job.seed, path)
+    else:
+        find(job.camera, job.processing, job.seed, path)
 
 
 def _build(job: MapJob, store: Store, data: Path) -> None:

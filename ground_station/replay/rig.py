@@ -29,40 +29,33 @@ class FirmwareProcess:
     """
 
     def __init__(self, config: dict[str, Any], folder: Path, prefix: Sequence[str] = ()) -> None:
-        self._config, self._folder, self._prefix = config, folder, prefix
-        self._log = folder / "firmware.log"
-        self._process: subprocess.Popen[bytes] | None = None
+        self._log, path = folder / "firmware.log", folder / "payload.toml"
+        path.write_bytes(tomli_w.dumps(config).encode())
+        self._command = [*prefix, sys.executable, "-m", "pi_firmware", "--config", str(path)]
 
     def __enter__(self) -> FirmwareProcess:
-        path = self._folder / "payload.toml"
-        path.write_bytes(tomli_w.dumps(self._config).encode())
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
-                [*self._prefix, sys.executable, "-m", "pi_firmware", "--config", str(path)],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
+                self._command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
             )
         return self
 
     def running(self) -> bool:
         """Whether the process is alive."""
-        return self._process is not None and self._process.poll() is None
+        return self._process.poll() is None
 
     def pid(self) -> int | None:
-        """The process's id; None before its start."""
-        return None if self._process is None else self._process.pid
+        """The process's id."""
+        return self._process.pid
 
     def check(self) -> None:
         """Raises `FirmwareError` with the firmware's own last line when it ended with an error."""
-        status = None if self._process is None else self._process.poll()
-        if status:
+        if status := self._process.poll():
             lines = self._log.read_text(errors="replace").strip().splitlines()
             said = lines[-1] if lines else "nothing"
             raise FirmwareError(f"the firmware ended with status {status}: {said}")
 
     def __exit__(self, *_: object) -> None:
-        assert self._process is not None
         self._process.terminate()
         try:
             self._process.wait(timeout=5)

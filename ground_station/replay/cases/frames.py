@@ -10,7 +10,7 @@ import hashlib
 import io
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -222,32 +222,28 @@ class Difference:
 
 def pairs(a: Frames, b: Frames) -> Pairs:
     """Pairs of exactly the same capture time; of several at one time the n-th with the n-th."""
-    index_b = {key: k for k, key in enumerate(_keys(b))}
-    found: list[tuple[int, int]] = []
-    only_a: list[int] = []
-    for k, key in enumerate(_keys(a)):
-        other = index_b.pop(key, None)
-        if other is None:
-            only_a.append(k)
-        else:
-            found.append((k, other))
-    found.sort(key=lambda pair: (int(a.time_ns[pair[0]]), pair))
-    both = np.array(found, dtype=np.intp).reshape(-1, 2)
+    index_a, index_b = _indices(a), _indices(b)
+    both = sorted(index_a.keys() & index_b.keys())
+
+    def array(indices: Iterable[int]) -> Indices:
+        return np.fromiter(indices, np.intp)
+
     return Pairs(
-        both[:, 0],
-        both[:, 1],
-        np.array(only_a, dtype=np.intp),
-        np.array(sorted(index_b.values()), dtype=np.intp),
+        array(index_a[key] for key in both),
+        array(index_b[key] for key in both),
+        array(k for key, k in index_a.items() if key not in index_b),
+        array(k for key, k in index_b.items() if key not in index_a),
     )
 
 
-def _keys(frames: Frames) -> list[tuple[int, int]]:
+def _indices(frames: Frames) -> dict[tuple[int, int], int]:
+    """By capture time, and number among those of the same."""
     seen: Counter[int] = Counter()
-    keys = []
-    for time_ns in frames.time_ns.tolist():
-        keys.append((time_ns, seen[time_ns]))
+    found = {}
+    for k, time_ns in enumerate(frames.time_ns.tolist()):
+        found[time_ns, seen[time_ns]] = k
         seen[time_ns] += 1
-    return keys
+    return found
 
 
 def differing(a: Frames, b: Frames, both: Pairs) -> Bools:
