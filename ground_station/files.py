@@ -32,6 +32,13 @@ def check_outputs(*paths: str | Path | None, are_folders: bool = False) -> None:
             raise InputError(f"{path}: no permission to write in {folder}; name another place")
 
 
+def check_new(path: Path, *, force: bool) -> None:
+    """Refuses a file that is there already, unless with force, and what `check_outputs` does."""
+    check_outputs(path)
+    if path.exists() and not force:
+        raise InputError(f"{path}: it exists already; --force overwrites it")
+
+
 def read_bytes(path: str | Path, most_bytes: int) -> bytes:
     """What a file holds; raises `InputError` with one line, also where it is larger than that."""
     path = Path(path)

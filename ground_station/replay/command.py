@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ground_station.errors import InputError
+from ground_station.errors import InputError, check_options
 from pi_firmware.wire.text import printable
 
 if TYPE_CHECKING:
@@ -246,16 +246,14 @@ def _make(args: argparse.Namespace, out: Path) -> int:
 
 
 def _accept(args: argparse.Namespace, out: Path) -> int:
-    from ground_station.files import check_outputs
+    from ground_station.files import check_new
     from ground_station.replay.cases.outcome import read_outcome
     from ground_station.replay.cases.truth import MISSING, accept, write_golden
 
     for name in ("by", "tolerance_m", "tolerance_deg"):
         if getattr(args, name) is None:
             raise InputError(f"--accept needs {_option(name)}")
-    check_outputs(out)
-    if out.exists() and not args.force:
-        raise InputError(f"{out}: it exists already; --force overwrites it")
+    check_new(out, force=args.force)
     outcome = read_outcome(args.accept)
     accepted = accept(
         outcome,
@@ -294,13 +292,10 @@ def _compare(args: argparse.Namespace, out: Path) -> int:
 def _allowed(args: argparse.Namespace) -> Allowed:
     from ground_station.replay.cases.compare import Allowed
 
-    given: dict[str, Any] = {}
-    for name in _OF["compare"]:
-        value = getattr(args, name)
-        if name.startswith("fail_over") and value is not None:
-            if not (math.isfinite(value) and value >= 0):
-                raise InputError(f"{_option(name)} is {value}; allowed: 0 or more")
-            given[name.removeprefix("fail_")] = value
+    names = [name for name in _OF["compare"] if name.startswith("fail_over")]
+    check_options(args, **dict.fromkeys(names, (0, math.inf)))
+    given = {name.removeprefix("fail_"): getattr(args, name) for name in names}
+    given = {name: value for name, value in given.items() if value is not None}
     return Allowed(**given, identical=args.identical)
 
 

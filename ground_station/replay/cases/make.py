@@ -18,7 +18,7 @@ from google.protobuf.message import DecodeError, Message
 from ground_station.errors import InputError
 from ground_station.evaluation import ate
 from ground_station.evaluation.figures import AT_LEAST, digits
-from ground_station.files import check_outputs, write_text
+from ground_station.files import check_new, write_text
 from ground_station.geometry.trajectory import Trajectory, read_tum
 from ground_station.map import store
 from ground_station.recording.flight import trajectory_of
@@ -96,14 +96,13 @@ def make_case(asked: Asked) -> Made:
     out = asked.out
     if out.suffix != ".toml" or not out.stem:
         raise InputError(f"{out}: a case is a .toml file")
-    check_outputs(out)
-    _free(out, asked.force)
+    check_new(out, force=asked.force)
     map_ = store.load(asked.map)
     prefix = _prefix(asked)
     if not prefix:
         return _make(asked, map_, asked.recording, Made())
     recording = out.with_suffix(".mcap")
-    _free(recording, asked.force)
+    check_new(recording, force=asked.force)
     count = extract(asked.recording, prefix, recording)
     note = f"the {count} frames of {prefix.strip('/')} are in a recording of their own"
     try:
@@ -176,11 +175,6 @@ def _keys(
     if keys.init == "truth" and not source.topics.get(TRUTH_TOPIC):
         raise InputError(f"--init truth: {missing(source, TRUTH_TOPIC)}")
     return keys
-
-
-def _free(path: Path, force: bool) -> None:
-    if path.exists() and not force:
-        raise InputError(f"{path}: it exists already; --force overwrites it")
 
 
 def _prefix(asked: Asked) -> str:
