@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -111,9 +110,3 @@ def evenly(total: int, wanted: int) -> set[int]:
     if not 0 < wanted < total:
         return set(range(total))
     return {round(k * (total - 1) / max(1, wanted - 1)) for k in range(wanted)}
-
-
-def moved(part: Path, folder: Path) -> None:
-    """Puts what was made beside in its place; what lay there, a cut attempt, goes."""
-    shutil.rmtree(folder, ignore_errors=True)
-    part.replace(folder)

@@ -73,7 +73,7 @@ def _film(job: LensJob | FlightJob, path: Path) -> None:
 
 
 def _build(job: MapJob, store: Store, data: Path) -> None:
-    from ground_station.experiments.maps import build, moved
+    from ground_station.experiments.maps import build
 
     folder = store.map(job.key)
     part = folder.with_name(f"{folder.name}.making")
@@ -82,7 +82,8 @@ def _build(job: MapJob, store: Store, data: Path) -> None:
     recording = store.flight(job.recording) if job.recording else None
     try:
         build(job.spec, recording, data, job.settings, part, store.cache, _lens(job, store))
-        moved(part, folder)
+        shutil.rmtree(folder, ignore_errors=True)  # a cut attempt
+        part.replace(folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)
 
