@@ -14,9 +14,10 @@ from ground_station.map import landmarks
 from ground_station.map.model import Model
 from ground_station.map.store import MapInfo
 from ground_station.map_update.extension.frames import Frames
+from ground_station.mapping.construction.matching import verify
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.placing.chains import components
-from ground_station.mapping.construction.verification import alike, rules_of, verify_pair
+from ground_station.mapping.construction.verification import alike, rules_of
 from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.models import without_observations
@@ -82,7 +83,7 @@ def match_frames(
 
     def one(i: int, j: int) -> TwoView | None:
         matches = alike(frames.features[i].descriptors, frames.features[j].descriptors, rules)
-        return verify_pair(pixels[i], pixels[j], matches, rules, info.camera.matrix)
+        return verify(pixels[i], pixels[j], matches, info.camera.matrix, rules)
 
     verified = []
     with Progress("matching, pairs", len(pairs)) as progress:

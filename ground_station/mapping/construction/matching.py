@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from ground_station.arrays import F32, F64, I32, Bools
+from ground_station.mapping.settings import MatchSettings
 from ground_station.mapping.sfm.two_view import TwoView
 
 _MIN_SAMPLE = 8
@@ -70,11 +71,9 @@ def verify(
     second_px: F64,
     matches: I32,
     camera_matrix: F64,
-    *,
-    error_px: float,
-    planar_ratio: float,
+    rules: MatchSettings,
 ) -> TwoView | None:
-    """The two-view geometry that most matches agree with, or None when there is none.
+    """The two-view geometry that most matches agree with, or None when it is none by the rules.
 
     `first_px` (N, 2) and `second_px` (M, 2) are undistorted pixels, `matches` (K, 2) indices into
     them, `camera_matrix` (3, 3). MAGSAC++ (Barath et al., CVPR 2020) finds the essential matrix; a
@@ -84,7 +83,7 @@ def verify(
     """
     if len(matches) < _MIN_SAMPLE:
         return None
-    p, q = first_px[matches[:, 0]], second_px[matches[:, 1]]
+    p, q, error_px = first_px[matches[:, 0]], second_px[matches[:, 1]], rules.error_px
     found = essential(p, q, camera_matrix, error_px, _CONFIDENCE, _MAX_ITERATIONS)
     if found is None:
         return None
@@ -98,14 +97,12 @@ def verify(
     degenerate = False
     if H is not None and planar is not None:
         on_plane = planar.ravel() != 0
-        degenerate = bool(on_plane.sum() >= planar_ratio * inliers.sum())
+        degenerate = bool(on_plane.sum() >= rules.planar_ratio * inliers.sum())
         if degenerate:
             inliers = on_plane
-    if inliers.sum() < _MIN_SAMPLE:
+    # Repeated patterns look alike without sharing a geometry.
+    fewest = max(rules.min_inliers, rules.min_inlier_ratio * len(matches))
+    if inliers.sum() < fewest:
         return None
-    return TwoView(
-        matches[inliers],
-        E,
-        None if H is None else np.asarray(H, np.float64),
-        degenerate,
-    )
+    homography = None if H is None else np.asarray(H, np.float64)
+    return TwoView(matches[inliers], E, homography, degenerate)

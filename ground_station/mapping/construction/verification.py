@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,40 +21,30 @@ from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.matching import mutual_matches, verify
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.workers import Threads, Workers
-from ground_station.mapping.settings import MappingSettings
+from ground_station.mapping.settings import MappingSettings, MatchSettings
 from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.progress import Progress
 
-
-@dataclass(frozen=True)
-class Rules:
-    """What counts as a match, and how much two images must share."""
-
-    ratio: float
-    error_px: float
-    planar_ratio: float
-    min_inliers: int
-    min_inlier_ratio: float = 0.0
-    preview: int = 0
-    preview_matches: int = 0
+_RULES = (
+    "ratio", "error_px", "planar_ratio", "min_inliers", "min_inlier_ratio", "preview",
+    "preview_matches",
+)  # fmt: skip
+"""Settings that decide what is found of a pair, and so are a part of its key in a cache."""
 
 
-def rules_of(settings: MappingSettings, far: bool) -> Rules:
-    """The settings' rules for neighbours in time, or for images far apart."""
+def rules_of(settings: MappingSettings, far: bool) -> MatchSettings:
+    """The settings' rules for neighbours in time, or for images far apart, of their features."""
     # Lowe's 0.8 is for SIFT. Of ALIKE's matches in the sample's mapping flight it leaves a third:
     # 47 verified pairs of 32 pictures, where 0.95 leaves 111.
     wanted = settings.match.of(settings.features)
-    if not far:
-        return Rules(wanted.ratio, wanted.error_px, wanted.planar_ratio, wanted.min_inliers)
-    return Rules(
-        wanted.ratio,
-        wanted.error_px,
-        wanted.planar_ratio,
-        wanted.min_inliers_far,
-        wanted.min_inlier_ratio,
-        wanted.preview,
-        wanted.preview_matches,
-    )
+    if far:
+        return replace(wanted, min_inliers=wanted.min_inliers_far)
+    return replace(wanted, min_inlier_ratio=0.0, preview=0, preview_matches=0)
+
+
+def key_of(rules: MatchSettings, camera: Camera) -> bytes:
+    """What, besides their features, decides the geometry of a pair that is compared by rules."""
+    return content.comparison(camera, {name: getattr(rules, name) for name in _RULES})
 
 
 def match(
@@ -105,7 +95,7 @@ def match(
     return dict(sorted(verified.items()))
 
 
-def alike(first: F32, second: F32, rules: Rules) -> I32:
+def alike(first: F32, second: F32, rules: MatchSettings) -> I32:
     """Matches (K, 2) of two images' descriptors by the rules; none where they are too few."""
     # Most pairs far apart share nothing, and a few of the strongest features tell: Wu,
     # "Towards linear-time incremental structure from motion", 3DV 2013, section 3.
@@ -116,28 +106,10 @@ def alike(first: F32, second: F32, rules: Rules) -> I32:
     return matches if len(matches) >= rules.min_inliers else matches[:0]
 
 
-def verify_pair(
-    first_px: F64, second_px: F64, matches: I32, rules: Rules, camera_matrix: F64
-) -> TwoView | None:
-    """The geometry that two images' matches share by the rules, or None."""
-    view = verify(
-        first_px,
-        second_px,
-        matches,
-        camera_matrix,
-        error_px=rules.error_px,
-        planar_ratio=rules.planar_ratio,
-    )
-    if view is None or len(view.matches) < rules.min_inliers:
-        return None
-    # Repeated patterns look alike without sharing a geometry.
-    if len(view.matches) < rules.min_inlier_ratio * len(matches):
-        return None
-    return view
-
-
 def verify_pairs(
-    pairs: Sequence[tuple[int, int, Rules, U16 | None]], camera_matrix: F64, *sides: Side | KeptSide
+    pairs: Sequence[tuple[int, int, MatchSettings, U16 | None]],
+    camera_matrix: F64,
+    *sides: Side | KeptSide,
 ) -> list[tuple[U16, TwoView | None]]:
     """Of each (i, j, rules, matches), i and j indices into `sides`: the matches (K, 2), by `alike`
     where they are not known, and the geometry that they share.
@@ -147,7 +119,7 @@ def verify_pairs(
     for i, j, rules, known in pairs:
         (first, first_px), (second, second_px) = opened[i], opened[j]
         matches = alike(first, second, rules) if known is None else known.astype(np.int32)
-        view = verify_pair(first_px, second_px, matches, rules, camera_matrix)
+        view = verify(first_px, second_px, matches, camera_matrix, rules)
         result.append((matches.astype(np.uint16), view))
     return result
 
@@ -170,9 +142,7 @@ class _Comparison:
         self._matrix = camera.matrix
         self._neighbours = settings.match.neighbours
         self._rules = {far: rules_of(settings, far) for far in (False, True)}
-        self._how = {
-            far: content.comparison(camera, asdict(rules)) for far, rules in self._rules.items()
-        }
+        self._how = {far: key_of(rules, camera) for far, rules in self._rules.items()}
         self._cache, self._workers, self._matched = cache, workers, matched
 
     def compare(self, pairs: Sequence[Pair], label: str) -> dict[Pair, TwoView]:

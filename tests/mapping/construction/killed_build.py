@@ -56,7 +56,7 @@ def main(out, folder, calls, step, count):
     extractor = SceneExtractor(scene)
     extractor.extract = note.around("extract", extractor.extract)
     extractors.METHODS["scene"] = lambda _: extractor
-    verification.verify_pair = note.around("verify", verification.verify_pair)
+    verification.verify = note.around("verify", verification.verify)
     store.save_tables = note.around("save", store.save_tables)
     stepped = Progress.step
 

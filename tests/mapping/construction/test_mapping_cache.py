@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import sqlite3
 import threading
-from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from ground_station.mapping.construction import cache as caching
 from ground_station.mapping.construction import content, entries
 from ground_station.mapping.construction.cache import Cache
 from ground_station.mapping.construction.entries import Entry, EntryError
-from ground_station.mapping.construction.verification import rules_of
+from ground_station.mapping.construction.verification import key_of, rules_of
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.two_view import TwoView
 
@@ -258,7 +257,7 @@ def _keys(settings, camera=CAMERA, image=IMAGE):
     one, other = (content.features_key(picture, how) for picture in (image, image + 1))
     return [
         one,
-        *(content.pair_key(one, other, content.comparison(camera, asdict(rules_of(settings, far))))
+        *(content.pair_key(one, other, key_of(rules_of(settings, far), camera))
           for far in (False, True)),
     ]  # fmt: skip
 
