@@ -65,7 +65,6 @@ class Solver:
         if not chains.moved(pairs, images.pinhole_px, camera.matrix, settings.match.error_px):
             raise MapError(_NO_START)
         self.names = images.names
-        self._counts = [len(pixels) for pixels in images.pinhole_px]
         self._sequence = sequences(images.names, images.time_ns)
         self.wanted = Wanted(
             settings.seed,
@@ -75,7 +74,8 @@ class Solver:
         )
         self._ordered = chains.in_order(self._sequence, pairs)
         near = chains.in_front(pairs, images.pinhole_px, camera.matrix, threads)
-        self.links = chains.links(self._counts, self._sequence, self._ordered, near)
+        counts = [len(pixels) for pixels in images.pinhole_px]
+        self.links = chains.links(counts, self._sequence, self._ordered, near)
         self.pairs: Pairs = {
             pair: near[pair] if pair in self.links else view for pair, view in pairs.items()
         }
@@ -156,9 +156,7 @@ class Solver:
         """
         moved: set[int] = set()
         while True:
-            tried = elsewhere.resected(
-                self.placed(model), pairs, self._images.pinhole_px, self.wanted.seed
-            )
+            tried = elsewhere.resected(self.placed(model), pairs, self.wanted.seed)
             better = next(
                 (
                     (k, other)
@@ -174,25 +172,20 @@ class Solver:
 
     def placed(self, model: colmap.Reconstruction) -> Placed:
         """The model by index of image and key point."""
-        return Placed.of(colmap.to_arrays(model), self._counts)
+        return Placed.of(colmap.to_arrays(model), self._images.pinhole_px)
 
     def rivals(self, model: colmap.Reconstruction, pairs: Pairs) -> dict[int, elsewhere.Rival]:
         """Images, by index, that fit in another place, too."""
-        return elsewhere.rivals(
-            self.placed(model), pairs, self._images.pinhole_px, self._camera.matrix
-        )
+        return elsewhere.rivals(self.placed(model), pairs)
 
     def misplaced(self, model: colmap.Reconstruction, pairs: Pairs) -> set[int]:
         """Images, by index, that the chain denies."""
-        links = self.links & pairs.keys()
-        return lookalikes.misplaced(self.placed(model), links, pairs, self._images.pinhole_px)
+        return lookalikes.misplaced(self.placed(model), self.links & pairs.keys(), pairs)
 
     def fall_apart(self, models: Models, chosen: Collection[Pair]) -> bool:
         """Whether a model is no longer one without the pairs that were not chosen."""
-        pixels = self._images.pinhole_px
         return any(
-            len(lookalikes.pieces(self.placed(model), chosen, self.pairs, pixels)) > 1
-            for model in models
+            len(lookalikes.pieces(self.placed(model), chosen, self.pairs)) > 1 for model in models
         )
 
     def _mapping(

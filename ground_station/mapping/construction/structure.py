@@ -68,7 +68,7 @@ def reconstruct(
     finds no model.
     """
     solver = Solver(images, pairs, camera, settings, threads, work)
-    links, pairs, pixels = solver.links, solver.pairs, images.pinhole_px
+    links, pairs = solver.links, solver.pairs
     tries = [solver.solve("before", pairs, starts=before)] if before else []
     # What went on from models that were believed are those, and their pairs were chosen already.
     held = len({k for model in tries[0][0] for k in model.reg_image_ids()}) if before else 0
@@ -98,14 +98,14 @@ def reconstruct(
     wrong |= better
     moved += len(better)
     if wrong:
-        lies = lookalikes.refuted(solver.placed(models[0]), wrong, links, pairs, pixels)
+        lies = lookalikes.refuted(solver.placed(models[0]), wrong, links, pairs)
         colmap.drop_images(models[0], [k + 1 for k in sorted(wrong)])
         pairs = loops.among(pairs, pairs.keys() - lies)
         models, notes = solver.solve("replaced", pairs, starts=models[:1])
     solver.settle(models[0], pairs)
     models[0], resected = solver.resected(models[0], pairs)
     moved += resected
-    models, notes, doubts = _Consistent(solver, pairs, pixels, camera, settings.sfm).of(
+    models, notes, doubts = _Consistent(solver, pairs, images, camera, settings.sfm).of(
         models, notes, spare, goes_on
     )
     doubts += elsewhere.doubt(solver.rivals(models[0], pairs), images.names)
@@ -134,15 +134,14 @@ class _Consistent:
         self,
         solver: Solver,
         pairs: Pairs,
-        pixels: Sequence[F64],
+        images: Images,
         camera: Camera,
         sfm: SfmSettings,
     ) -> None:
-        self._solver, self._pairs, self._pixels, self._sfm = solver, pairs, pixels, sfm
-        self._names = solver.names
+        self._solver, self._pairs, self._sfm = solver, pairs, sfm
         self._wanted = solver.wanted
         self._confirmed = contradictions.rotations(
-            pairs, pixels, camera.matrix, self._wanted.threads
+            pairs, images.pinhole_px, camera.matrix, self._wanted.threads
         )
 
     def of(
@@ -205,7 +204,7 @@ class _Consistent:
         elsewhere_too = elsewhere.otherwise(
             chosen, (self._solver.placed(one) for one in tried), self._wanted.seed
         )
-        return joined, notes, doubts + elsewhere.otherwise_doubt(elsewhere_too, self._names)
+        return joined, notes, doubts + elsewhere.otherwise_doubt(elsewhere_too, self._solver.names)
 
     def _settled(self, models: Models) -> Models:
         for model in models:
@@ -217,9 +216,7 @@ class _Consistent:
         pieces: Models = []
         for model in models:
             placed = self._solver.placed(model)
-            groups = contradictions.consistent_groups(
-                placed, self._confirmed, self._pairs, self._pixels
-            )
+            groups = contradictions.consistent_groups(placed, self._confirmed, self._pairs)
             sets = [part for group in groups for part in bridges.separated(placed.among(group))]
             if len(sets) == 1:
                 pieces.append(model)

@@ -44,9 +44,9 @@ def _pairs(wTc, matches):
     return result
 
 
-def _placed(wTc, world) -> Placed:
+def _placed(wTc, world, pixels) -> Placed:
     every = np.arange(len(world))
-    return Placed([every] * len(wTc), dict(enumerate(wTc)), world, PINHOLE)
+    return Placed([every] * len(wTc), dict(enumerate(wTc)), world, PINHOLE, pixels)
 
 
 def told(**options):
@@ -62,7 +62,7 @@ def test_rotations_of_a_right_model_are_confirmed_and_denied_by_nobody():
     for (i, j), R in found.items():
         here = poses.inverse(wTc[j])[:3, :3] @ wTc[i][:3, :3]
         assert np.degrees(poses.rotation_angle(R @ here.T)) < 1
-    groups = contradictions.consistent_groups(_placed(wTc, world), found, pairs, pixels)
+    groups = contradictions.consistent_groups(_placed(wTc, world, pixels), found, pairs)
     assert groups == [set(range(len(wTc)))]
 
 
@@ -71,12 +71,10 @@ def test_images_that_fit_where_their_pairs_deny_them_are_groups_of_their_own():
     wTc, world, pixels, pairs, found = told(half=(0.7, 0.7, 0.1))
     further = poses.exp(np.array([0, -np.radians(9), 0, 0, 0, 0]))
     turned = np.concatenate([wTc[:8], further @ wTc[8:]])
-    model = _placed(turned, world)
-    good, total = np.sum(
-        [model.in_place(pair, view, pixels) for pair, view in pairs.items()], axis=0
-    )
+    model = _placed(turned, world, pixels)
+    good, total = np.sum([model.in_place(pair, view) for pair, view in pairs.items()], axis=0)
     assert good > 0.9 * total
-    groups = contradictions.consistent_groups(model, found, pairs, pixels)
+    groups = contradictions.consistent_groups(model, found, pairs)
     assert groups == [set(range(8)), set(range(8, 12))]
 
 
@@ -85,7 +83,7 @@ def test_a_rotation_that_is_off_denies_nothing_that_fits_its_matches_as_well():
     wTc, world, pixels, pairs, found = told()
     off = poses.exp(np.array([0, np.radians(12), 0, 0, 0, 0]))[:3, :3]
     wrong = {(i, j): off @ R if i < 6 <= j else R for (i, j), R in found.items()}
-    groups = contradictions.consistent_groups(_placed(wTc, world), wrong, pairs, pixels)
+    groups = contradictions.consistent_groups(_placed(wTc, world, pixels), wrong, pairs)
     assert groups == [set(range(len(wTc)))]
 
 

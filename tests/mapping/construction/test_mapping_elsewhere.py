@@ -34,7 +34,7 @@ def view(count: int) -> TwoView:
     return TwoView(matches, np.eye(3), None, degenerate=False)
 
 
-def wall(there: int) -> tuple[Placed, dict, list[np.ndarray]]:
+def wall(there: int) -> tuple[Placed, dict]:
     """Three images of a bay, two of the next one, and the last, of which the next bay's two say
     with `there` key points that it is theirs; it stands at the first."""
     rng = np.random.default_rng(3)
@@ -46,19 +46,19 @@ def wall(there: int) -> tuple[Placed, dict, list[np.ndarray]]:
     landmark = [np.arange(N)] * 3 + [np.arange(N, 2 * N)] * 2 + [np.arange(N)]
     model = Placed(
         landmark, {k: camera(x) for k, x in enumerate(x_m)}, points,
-        np.array([500.0, 500.0, 320.0, 240.0]),
+        np.array([500.0, 500.0, 320.0, 240.0]), pixels,
     )  # fmt: skip
     pairs = {(0, 1): view(N), (0, 2): view(N), (3, 4): view(N), (0, 5): view(N)}
     pairs |= {(3, 5): view(there), (4, 5): view(there)}
-    return model, pairs, pixels
+    return model, pairs
 
 
 @pytest.mark.parametrize(("there", "doubtful"), [(20, False), (60, True)])
 def test_an_image_that_fits_the_next_bay_nearly_as_well_is_doubtful(
     there: int, doubtful: bool
 ) -> None:
-    model, pairs, pixels = wall(there)
-    found = elsewhere.rivals(model, pairs, pixels, MATRIX)
+    model, pairs = wall(there)
+    found = elsewhere.rivals(model, pairs)
     assert found[5] == Rival(here=N, there=there)
     assert found[5].doubtful is doubtful and not found[5].better
     said = elsewhere.doubt(found, [f"frame-{k}" for k in range(6)])
@@ -66,29 +66,29 @@ def test_an_image_that_fits_the_next_bay_nearly_as_well_is_doubtful(
 
 
 def test_one_that_fits_the_next_bay_much_better_is_to_go_there() -> None:
-    model, pairs, pixels = wall(60)
+    model, pairs = wall(60)
     model.landmark[5] = np.where(np.arange(N) < 25, np.arange(N), -1)
-    assert elsewhere.rivals(model, pairs, pixels, MATRIX)[5] == Rival(here=25, there=60)
+    assert elsewhere.rivals(model, pairs)[5] == Rival(here=25, there=60)
     assert Rival(25, 60).better and not Rival(60, 25).better and not Rival(60, 25).doubtful
 
 
 def test_a_model_whose_pairs_hold_has_no_rival() -> None:
-    model, pairs, pixels = wall(60)
+    model, pairs = wall(60)
     held = {pair: pairs[pair] for pair in pairs if pair not in ((3, 5), (4, 5))}
-    assert elsewhere.rivals(model, held, pixels, MATRIX) == {}
+    assert elsewhere.rivals(model, held) == {}
     assert elsewhere.doubt({}, []) == []
 
 
 def test_a_pair_that_breaks_by_a_drift_is_no_other_place() -> None:
     """Landmarks that stand twice, a little apart, place the image where it is."""
-    model, pairs, pixels = wall(60)
+    model, pairs = wall(60)
     model.position[N:] = model.position[:N] + np.array([0.15, 0.0, 0.0])
-    assert 5 not in elsewhere.rivals(model, pairs, pixels, MATRIX)
+    assert 5 not in elsewhere.rivals(model, pairs)
 
 
 def test_what_several_images_say_alike_counts_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """OpenCV ends with an error when it draws one point twice."""
-    model, pairs, pixels = wall(60)
+    model, pairs = wall(60)
     solve, drawn = elsewhere.cv2.solvePnPRansac, []
 
     def solved(points: np.ndarray, *rest: object, **named: object) -> object:
@@ -96,7 +96,7 @@ def test_what_several_images_say_alike_counts_once(monkeypatch: pytest.MonkeyPat
         return solve(points, *rest, **named)
 
     monkeypatch.setattr(elsewhere.cv2, "solvePnPRansac", solved)
-    assert elsewhere.rivals(model, pairs, pixels, MATRIX)[5] == Rival(here=N, there=60)
+    assert elsewhere.rivals(model, pairs)[5] == Rival(here=N, there=60)
     assert all(len(np.unique(points, axis=0)) == len(points) for points in drawn) and drawn
 
 
@@ -143,8 +143,9 @@ def test_a_build_whose_tries_deny_each_other_says_so(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(structure._Consistent, "_split", lambda _, models: models)
     pairs = {(k, k + 1): view(N) for k in range(29)}
     camera, sfm = SimpleNamespace(matrix=MATRIX), SfmSettings()
+    images = SimpleNamespace(pinhole_px=[])
     for moved, doubts in ((BAY_M, 1), (0.0, 0)):
-        judge = structure._Consistent(solver, pairs, [], camera, sfm)  # type: ignore[arg-type]
+        judge = structure._Consistent(solver, pairs, images, camera, sfm)  # type: ignore[arg-type]
         spare = [Model(placed=row(moved, N))]
         said = judge.of([Model(placed=row(0.0, N))], [], spare, False)[2]  # type: ignore[list-item]
         assert len(said) == doubts

@@ -57,22 +57,16 @@ def _judged(corridor, work, before=()) -> structure.Structure:
     )
 
 
-def _counts(corridor) -> list[int]:
-    return [len(pixels) for pixels in corridor.images.pinhole_px]
-
-
 def _links(corridor) -> set[tuple[int, int]]:
     sequence = sequences(corridor.images.names, corridor.images.time_ns)
     ordered = chains.in_order(sequence, corridor.pairs)
     near = chains.in_front(corridor.pairs, corridor.images.pinhole_px, corridor.camera.matrix)
-    return chains.links(_counts(corridor), sequence, ordered, near)
+    return chains.links([*map(len, corridor.images.pinhole_px)], sequence, ordered, near)
 
 
 def _misplaced(corridor, model) -> set[int]:
-    placed = Placed.of(colmap.to_arrays(model), _counts(corridor))
-    return lookalikes.misplaced(
-        placed, _links(corridor), corridor.pairs, corridor.images.pinhole_px
-    )
+    placed = Placed.of(colmap.to_arrays(model), corridor.images.pinhole_px)
+    return lookalikes.misplaced(placed, _links(corridor), corridor.pairs)
 
 
 def test_plain_structure_from_motion_folds_the_corridor_and_the_judged_one_does_not(
@@ -107,9 +101,9 @@ def test_the_judge_doubts_nobody_in_a_right_model_and_many_in_the_folded_one(
     assert _misplaced(corridor, judged.reconstruction) == set()
     wrong = _misplaced(corridor, plain)
     assert len(wrong) > 10
-    placed = Placed.of(colmap.to_arrays(plain), _counts(corridor))
+    placed = Placed.of(colmap.to_arrays(plain), corridor.images.pinhole_px)
     links = _links(corridor)
-    lies = lookalikes.refuted(placed, wrong, links, corridor.pairs, corridor.images.pinhole_px)
+    lies = lookalikes.refuted(placed, wrong, links, corridor.pairs)
     assert lies and not lies & links
 
 
@@ -117,7 +111,7 @@ def test_a_model_of_the_chain_tells_the_way_back_from_the_next_bay(corridor, tmp
     links = _links(corridor)
     model = _plain(corridor, loops.among(corridor.pairs, links), tmp_path)
     assert geometry.error_m(corridor, model).max() < 0.3
-    placed = Placed.of(colmap.to_arrays(model), _counts(corridor))
+    placed = Placed.of(colmap.to_arrays(model), corridor.images.pinhole_px)
     sequence = np.zeros(len(corridor.images.names), dtype=np.int64)
     believed = loops.believed([placed], sequence, links, corridor.pairs)
     assert not believed & corridor.misled

@@ -117,6 +117,7 @@ def _joined(
     adjustment.adjust(
         reconstruction, loss_px=settings.sfm.loss_px, threads=threads, tolerance=_TOLERANCE
     )
+    placed = Placed.of(colmap.to_arrays(reconstruction), images.pinhole_px)
     for part, core, _ in inside:
         within = f"{images.names[core[0]]} to {images.names[core[-1]]}, {len(core)} images"
         notes += [f"part of {within}: {note}" for note in part.notes.tolist()]
@@ -125,14 +126,8 @@ def _joined(
         [len(model.names), *sorted(apart, reverse=True)],
         [],
         notes + joined.notes,
-        doubts=elsewhere.doubt(
-            elsewhere.rivals(
-                Placed.of(colmap.to_arrays(reconstruction), [len(p) for p in images.pinhole_px]),
-                pairs, images.pinhole_px, camera.matrix,
-            ),
-            images.names,
-        ),
-    )  # fmt: skip
+        doubts=elsewhere.doubt(elsewhere.rivals(placed, pairs), images.names),
+    )
 
 
 def unite(

@@ -74,10 +74,7 @@ def _rotation(view: TwoView, first_px: F64, second_px: F64, camera_matrix: F64) 
 
 
 def consistent_groups(
-    model: Placed,
-    confirmed: Mapping[Pair, F64],
-    pairs: Mapping[Pair, TwoView],
-    pixels: Sequence[F64],
+    model: Placed, confirmed: Mapping[Pair, F64], pairs: Mapping[Pair, TwoView]
 ) -> list[set[int]]:
     """A model's images, by index, in groups that contradict themselves little; largest first.
 
@@ -91,10 +88,10 @@ def consistent_groups(
     for (i, j), view in pairs.items():
         if not {i, j} <= model.wTc.keys():
             continue
-        good, total = model.in_place((i, j), view, pixels)
+        good, total = model.in_place((i, j), view)
         if total < SPEAKS or good < HOLDS * total:
             continue
-        denied = (i, j) in confirmed and _denied(model, (i, j), confirmed[i, j], view, pixels)
+        denied = (i, j) in confirmed and _denied(model, (i, j), confirmed[i, j], view)
         sign = -_AGAINST if denied else 1
         weight[i][j] = weight[j][i] = sign * len(view.matches)
     first, *others = sorted(_contracted(weight), key=lambda group: (-len(group), min(group)))
@@ -109,17 +106,15 @@ def consistent_groups(
     return [first | alone, *(group for group in others if not group <= alone)]
 
 
-def _denied(model: Placed, pair: Pair, rotation: F64, view: TwoView, pixels: Sequence[F64]) -> bool:
+def _denied(model: Placed, pair: Pair, rotation: F64, view: TwoView) -> bool:
     """Whether the model has the pair at another rotation, and their matches worse for it."""
     i, j = pair
     here = poses.inverse(model.wTc[j])[:3, :3] @ model.wTc[i][:3, :3]
     if _angle_deg(here, rotation) <= _DENIES_DEG:
         return False
-    matched = pixels[i][view.matches[:, 0]], pixels[j][view.matches[:, 1]]
+    matched = model.pixels[i][view.matches[:, 0]], model.pixels[j][view.matches[:, 1]]
     theirs = essential(model.wTc[i], model.wTc[j])
-    fx, fy, cx, cy = model.pinhole
-    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    own, held = (np.median(sampson_px(*matched, E, matrix)) for E in (view.essential, theirs))
+    own, held = (np.median(sampson_px(*matched, E, model.matrix)) for E in (view.essential, theirs))
     return bool(held > _DENIES_RATIO * own)
 
 

@@ -59,54 +59,50 @@ class Rival:
         return self.here <= SECOND * self.there
 
 
-def rivals(
-    model: Placed, pairs: Mapping[Pair, TwoView], pixels: Sequence[F64], camera_matrix: F64
-) -> dict[int, Rival]:
-    """The images, by index, that their broken pairs would place elsewhere, doubtful or not.
-
-    `pixels` (N, 2) are each image's undistorted key points.
-    """
-    key_point: dict[int, list[I64]] = {}
-    landmark: dict[int, list[I64]] = {}
-    for (i, j), view in pairs.items():
-        if not {i, j} <= model.wTc.keys():
-            continue
-        good, total = model.in_place((i, j), view, pixels)
-        if total < SPEAKS or good > BREAKS * total:
-            continue
-        for mine, other, matches in ((i, j, view.matches), (j, i, view.matches[:, ::-1])):
-            seen = model.landmark[other][matches[:, 1]]
-            key_point.setdefault(mine, []).append(matches[seen >= 0, 0].astype(np.int64))
-            landmark.setdefault(mine, []).append(seen[seen >= 0])
+def rivals(model: Placed, pairs: Mapping[Pair, TwoView]) -> dict[int, Rival]:
+    """The images, by index, that their broken pairs would place elsewhere, doubtful or not."""
+    broken = {}
+    for pair, view in pairs.items():
+        if {*pair} <= model.wTc.keys():
+            good, total = model.in_place(pair, view)
+            if total >= SPEAKS and good <= BREAKS * total:
+                broken[pair] = view
     found = {}
-    for k, lists in sorted(key_point.items()):
+    for k, said in _said(model, broken).items():
         here = int(np.count_nonzero(model.landmark[k] >= 0))
-        # Several images may say the same of it, and a sample of one and the same has no pose.
-        said = np.unique([np.concatenate(lists), np.concatenate(landmark[k])], axis=1)
-        index, points = said[0], model.position[said[1]]
-        there = _elsewhere(model, k, index, pixels[k][index], points, camera_matrix)
+        there = _elsewhere(model, k, said)
         if there >= SPEAKS:
             found[k] = Rival(here, there)
     return found
 
 
-def _elsewhere(
-    model: Placed,
-    image: int,
-    key_point: I64,
-    pixel: F64,
-    points: F64,
-    camera_matrix: F64,
-) -> int:
-    """How many of an image's key points the best pose from these landmarks explains.
+def _said(model: Placed, pairs: Mapping[Pair, TwoView]) -> dict[int, I64]:
+    """What pairs say of each placed image, by index: its key points and landmarks there (N, 2).
+
+    Several images may say the same of it, which counts once: a sample of one and the same has no
+    pose.
+    """
+    found: dict[int, list[I64]] = {}
+    for (i, j), view in pairs.items():
+        if {i, j} <= model.wTc.keys():
+            for mine, other, matches in ((i, j, view.matches), (j, i, view.matches[:, ::-1])):
+                landmark = model.landmark[other][matches[:, 1]]
+                both = np.stack([matches[:, 0], landmark], axis=1)[landmark >= 0]
+                found.setdefault(mine, []).append(both.astype(np.int64))
+    return {k: np.unique(np.concatenate(lists), axis=0) for k, lists in sorted(found.items())}
+
+
+def _elsewhere(model: Placed, image: int, said: I64) -> int:
+    """How many of an image's key points the best pose from what is `said` (N, 2) explains.
 
     0 where that is its own place.
     """
-    if len(points) < SPEAKS:
+    if len(said) < SPEAKS:
         return 0
+    points, pixel = model.position[said[:, 1]], model.pixels[image][said[:, 0]]
     try:
         solved, turn, t, inliers = cv2.solvePnPRansac(
-            points, pixel, camera_matrix, None,
+            points, pixel, model.matrix, None,
             iterationsCount=_DRAWS, reprojectionError=IN_PLACE_PX, flags=cv2.SOLVEPNP_SQPNP,
         )  # fmt: skip
     except cv2.error:  # a sample has no pose
@@ -116,7 +112,7 @@ def _elsewhere(
     wTc = poses.inverse(poses.pose(cv2.Rodrigues(turn)[0], t.ravel()))
     if np.linalg.norm(wTc[:3, 3] - model.wTc[image][:3, 3]) <= SLACK_DEPTHS * model.depth:
         return 0
-    return len(np.unique(key_point[inliers.ravel()]))
+    return len(np.unique(said[inliers.ravel(), 0]))
 
 
 def doubt(found: Mapping[int, Rival], names: Sequence[str]) -> list[str]:
@@ -124,8 +120,9 @@ def doubt(found: Mapping[int, Rival], names: Sequence[str]) -> list[str]:
     doubtful = [k for k, rival in sorted(found.items()) if rival.doubtful]
     if not doubtful:
         return []
+    fit = "one image fits" if len(doubtful) == 1 else f"{len(doubtful)} images fit"
     return [
-        f"{_images(doubtful)} in another place nearly as well as in theirs, because what is seen"
+        f"{fit} in another place nearly as well as in theirs, because what is seen"
         f" repeats itself: {_shown(doubtful, names)}"
     ]
 
@@ -175,32 +172,17 @@ def _shown(index: Sequence[int], names: Sequence[str]) -> str:
     return ", ".join(names[k] for k in index[:_SHOWN]) + more
 
 
-def _images(index: Iterable[int]) -> str:
-    count = len(list(index))
-    return "one image fits" if count == 1 else f"{count} images fit"
-
-
-def resected(
-    model: Placed, pairs: Mapping[Pair, TwoView], pixels: Sequence[F64], seed: int
-) -> dict[int, F64]:
+def resected(model: Placed, pairs: Mapping[Pair, TwoView], seed: int) -> dict[int, F64]:
     """Poses (4, 4) of images, by index, that stand elsewhere, the best supported ones first.
 
-    `pixels` (N, 2) are each image's undistorted key points. A pose is given where it explains at
-    least half as many key points as the model's own; it may still be the wrong one of the two.
+    A pose is given where it explains at least half as many key points as the model's own; it may
+    still be the wrong one of the two.
     """
-    seen: dict[int, list[I64]] = {k: [] for k in model.wTc}
-    for (i, j), view in pairs.items():
-        if {i, j} <= seen.keys():
-            for mine, other, matches in ((i, j, view.matches), (j, i, view.matches[:, ::-1])):
-                landmark = model.landmark[other][matches[:, 1]]
-                both = np.stack([matches[:, 0], landmark], axis=1)[landmark >= 0]
-                seen[mine].append(both.astype(np.int64))
     found = {}
-    for k, lists in seen.items():
-        both = np.unique(np.concatenate([*lists, np.empty((0, 2), np.int64)]), axis=0)
+    for k, both in _said(model, pairs).items():
         if len(both) < SPEAKS:
             continue
-        pixel, landmark = pixels[k][both[:, 0]], both[:, 1]
+        pixel, landmark = model.pixels[k][both[:, 0]], both[:, 1]
         wTc = _resection(pixel, model.position[landmark], model.pinhole, seed)
         if wTc is None:
             continue

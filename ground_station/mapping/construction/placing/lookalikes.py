@@ -10,11 +10,10 @@ landmarks that an image should see and does not. Where there is a chain, it says
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from ground_station.arrays import F64
 from ground_station.mapping.construction.pairs import Pair
 from ground_station.mapping.construction.placing.chains import components
 from ground_station.mapping.construction.placing.placed import Placed
@@ -29,18 +28,13 @@ _PIECE = 5
 """Images that hold together by themselves; fewer hang by their poses."""
 
 
-def misplaced(
-    model: Placed,
-    links: Iterable[Pair],
-    pairs: Mapping[Pair, TwoView],
-    pixels: Sequence[F64],
-) -> set[int]:
+def misplaced(model: Placed, links: Iterable[Pair], pairs: Mapping[Pair, TwoView]) -> set[int]:
     """The images, by index, that the chain says are in the wrong place; empty where none is.
 
     From the largest piece to the smallest, each is believed unless a link breaks between it and a
-    piece that is believed already. `pixels` (N, 2) are each image's undistorted key points.
+    piece that is believed already.
     """
-    holding, broken = _judged(model, links, pairs, pixels)
+    holding, broken = _judged(model, links, pairs)
     piece = components([np.array(holding, np.int64).reshape(-1, 2)], len(model.landmark))
     against: dict[int, set[int]] = {}
     for i, j in broken:
@@ -57,14 +51,9 @@ def misplaced(
     return {int(k) for k in placed if int(piece[k]) not in believed}
 
 
-def pieces(
-    model: Placed,
-    chosen: Iterable[Pair],
-    pairs: Mapping[Pair, TwoView],
-    pixels: Sequence[F64],
-) -> list[set[int]]:
+def pieces(model: Placed, chosen: Iterable[Pair], pairs: Mapping[Pair, TwoView]) -> list[set[int]]:
     """The model's images, by index, in sets that the chosen pairs hold together; not the few."""
-    holding, _ = _judged(model, chosen, pairs, pixels)
+    holding, _ = _judged(model, chosen, pairs)
     piece = components([np.array(holding, np.int64).reshape(-1, 2)], len(model.landmark))
     placed = np.array(sorted(model.wTc), dtype=np.int64)
     sets = [{*placed[piece[placed] == number].tolist()} for number in np.unique(piece[placed])]
@@ -72,17 +61,14 @@ def pieces(
 
 
 def _judged(
-    model: Placed,
-    chosen: Iterable[Pair],
-    pairs: Mapping[Pair, TwoView],
-    pixels: Sequence[F64],
+    model: Placed, chosen: Iterable[Pair], pairs: Mapping[Pair, TwoView]
 ) -> tuple[list[Pair], list[Pair]]:
     """Which of the chosen pairs hold in the model, and which are broken."""
     holding: list[Pair] = []
     broken: list[Pair] = []
     for pair in sorted(chosen):
         if {*pair} <= model.wTc.keys():
-            good, total = model.in_place(pair, pairs[pair], pixels)
+            good, total = model.in_place(pair, pairs[pair])
             if total >= SPEAKS and good >= HOLDS * total:
                 holding.append(pair)
             elif total >= SPEAKS and good <= BREAKS * total:
@@ -91,11 +77,7 @@ def _judged(
 
 
 def refuted(
-    model: Placed,
-    wrong: set[int],
-    links: set[Pair],
-    pairs: Mapping[Pair, TwoView],
-    pixels: Sequence[F64],
+    model: Placed, wrong: set[int], links: set[Pair], pairs: Mapping[Pair, TwoView]
 ) -> set[Pair]:
     """The pairs that put the misplaced where they are; what they say is not so."""
     found = set()
@@ -103,7 +85,7 @@ def refuted(
         i, j = pair
         if (i in wrong) == (j in wrong) or pair in links or not {i, j} <= model.wTc.keys():
             continue
-        good, total = model.in_place(pair, view, pixels)
+        good, total = model.in_place(pair, view)
         if total and good >= HOLDS * total:
             found.add(pair)
     return found
