@@ -123,9 +123,9 @@ def test_parts_find_their_places_whatever_their_own_coordinates():
     scene = _scene()
     runs = [range(30), range(20, 50), range(40, 60)]
     parts = [_solved(scene, run, by) for run, by in zip(runs, PLACES, strict=True)]
-    joined = joining.join(parts, 0)
-    assert joined.notes == []
-    for part, at in zip(parts, joined.similarities, strict=True):
+    similarities, notes = joining.join(parts, 0)
+    assert notes == []
+    for part, at in zip(parts, similarities, strict=True):
         assert np.allclose(at.apply_poses(part.wTc), scene[0][part.index], atol=1e-6)
 
 
@@ -145,18 +145,18 @@ def test_a_junction_that_all_others_contradict_is_left_out_and_said():
         feature=np.concatenate([other.feature, last.feature]),
         point=np.concatenate([other.point + len(last.position), last.point]),
     )
-    joined = joining.join([*parts[:2], fold], 0)
-    assert "parts 0 and 2 over 5 images: other parts contradict it" in " ".join(joined.notes)
-    moved = joined.similarities[2].apply_poses(last.wTc)
+    similarities, notes = joining.join([*parts[:2], fold], 0)
+    assert "parts 0 and 2 over 5 images: other parts contradict it" in " ".join(notes)
+    moved = similarities[2].apply_poses(last.wTc)
     assert np.allclose(moved, scene[0][last.index], atol=1e-3)
 
 
 def test_parts_with_nothing_in_common_stay_apart_and_are_counted():
     scene = _scene()
     parts = [_solved(scene, range(30), PLACES[0]), _solved(scene, range(40, 60), PLACES[1])]
-    joined = joining.join(parts, 0)
-    assert joined.similarities[1] is None
-    assert joined.notes == ["20 images are in parts that join no other"]
+    similarities, notes = joining.join(parts, 0)
+    assert similarities[1] is None
+    assert notes == ["20 images are in parts that join no other"]
 
 
 def _united(scene, runs, pairs):
@@ -248,8 +248,7 @@ def test_in_parts_a_campus_is_whole_and_as_true_as_in_one(hall, tmp_path, monkey
 def test_workers_that_read_no_files_of_ours_make_the_same_parts(hall, tmp_path):
     few = {pair: view for pair, view in hall[1].items() if max(pair) < 34}
     first = solving.given(np.arange(34), hall[0], few)
-    images = Images(first.names, first.time_ns, [], first.pinhole_px)
-    pairs = first.pairs
+    images, pairs = first.images, first.pairs
     expected = reconstruct(images, pairs, CAMERA, SETTINGS, 1, tmp_path / "a", Threads(1))
     with open_workers("1", 1, SETTINGS) as workers:
         workers.here = False

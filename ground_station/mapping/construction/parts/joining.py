@@ -8,12 +8,14 @@ Davison, "Scale drift-aware large scale monocular SLAM", RSS 2010, close loops o
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
+from ground_station.arrays import I64
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment
 from ground_station.mapping.construction.parts.solving import Solved
@@ -49,21 +51,14 @@ class Edge:
     common: int
 
 
-@dataclass(frozen=True)
-class Joined:
-    """Where parts are: a similarity from each part's coordinates to common ones, None without.
+def join(parts: Sequence[Solved], seed: int) -> tuple[list[Alignment | None], list[str]]:
+    """Joins parts to the largest set that holds together; its largest part gives the scale.
 
-    `notes` say which parts stay out and which junctions are not believed.
+    The similarity from each part's coordinates to common ones, None for those that stay out, and
+    notes on these and on junctions that are not believed.
     """
-
-    similarities: list[Alignment | None]
-    notes: list[str]
-
-
-def join(parts: Sequence[Solved], seed: int) -> Joined:
-    """Joins parts to the largest set that holds together; its largest part gives the scale."""
     if len(parts) == 1:
-        return Joined([_identity()], [])
+        return [_identity()], []
     edges, doubtful = _edges(parts, seed)
     depth = [_depth(part) for part in parts]
     found: list[Alignment | None] = []
@@ -80,7 +75,7 @@ def join(parts: Sequence[Solved], seed: int) -> Joined:
     notes = [f"junction of {line}: not used" for line in doubtful]
     if apart:
         notes.append(f"{apart} images are in parts that join no other")
-    return Joined(found, notes)
+    return found, notes
 
 
 def _named(edge: Edge) -> str:
@@ -89,17 +84,9 @@ def _named(edge: Edge) -> str:
 
 def _edges(parts: Sequence[Solved], seed: int) -> tuple[list[Edge], list[str]]:
     """Junctions of all pairs of parts with enough images in common; what speaks against others."""
-    holders: dict[int, list[int]] = {}
-    for number, part in enumerate(parts):
-        for k in part.index.tolist():
-            holders.setdefault(k, []).append(number)
-    common: dict[tuple[int, int], list[int]] = {}
-    for k, numbers in holders.items():
-        for n, one in enumerate(numbers):
-            for other in numbers[n + 1 :]:
-                common.setdefault((one, other), []).append(k)
     edges, doubtful = [], []
-    for (one, other), images in sorted(common.items()):
+    for one, other in itertools.combinations(range(len(parts)), 2):
+        images = np.intersect1d(parts[one].index, parts[other].index)
         if len(images) < _FEWEST:
             continue
         width = 1 + max(int(parts[n].feature.max(initial=0)) for n in (one, other))
@@ -112,7 +99,7 @@ def _edges(parts: Sequence[Solved], seed: int) -> tuple[list[Edge], list[str]]:
     return edges, doubtful
 
 
-def _among(part: Solved, images: Sequence[int], width: int) -> Placed:
+def _among(part: Solved, images: I64, width: int) -> Placed:
     """A part's landmarks as those images see them, which count from 0 here."""
     rows = np.searchsorted(part.index, images)
     place = np.full(len(part.index), -1, dtype=np.int64)

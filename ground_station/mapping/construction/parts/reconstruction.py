@@ -99,17 +99,15 @@ def _joined(
             "move sideways between images that see the same things"
         )
     solved = [each for each, _ in kept]
-    joined = joining.join(solved, settings.seed)
+    similarities, said = joining.join(solved, settings.seed)
     inside = [
         (part, core, at)
-        for (part, core), at in zip(kept, joined.similarities, strict=True)
+        for (part, core), at in zip(kept, similarities, strict=True)
         if at is not None
     ]
     members, cores, places = (list(column) for column in zip(*inside, strict=True))
     model = unite(members, cores, places, images, pairs, camera)
-    apart = [
-        len(part.index) for part, at in zip(solved, joined.similarities, strict=True) if at is None
-    ]
+    apart = [len(part.index) for part, at in zip(solved, similarities, strict=True) if at is None]
     # The parts were adjusted each by itself; the way along which they bend lowers the cost slowly.
     pixels = [images.pinhole_px[k] for k in (model.image_id - 1).tolist()]
     notes = [f"structure from motion in {len(parts)} parts, {len(members)} of them joined"]
@@ -125,7 +123,7 @@ def _joined(
         reconstruction,
         [len(model.names), *sorted(apart, reverse=True)],
         [],
-        notes + joined.notes,
+        notes + said,
         doubts=elsewhere.doubt(elsewhere.rivals(placed, pairs), images.names),
     )
 

@@ -24,20 +24,16 @@ from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.two_view import TwoView
 from pi_firmware.wire import files
 
-_ARRAYS = ("index", "wTc", "position", "image", "feature", "point", "pinhole", "notes")
-
 
 @dataclass(frozen=True)
 class Given:
-    """What is known of a part: its images, by index in the build (K,), and pairs of them (i, j).
+    """What is known of a part: the `index` (K,) of its images in the build, they, and their pairs.
 
-    `pinhole_px` (N, 2) and names are in the order of `index`, and pairs are of places in it.
+    The images are without features, in the order of `index`; pairs (i, j) are of places in it.
     """
 
     index: I64
-    names: list[str]
-    time_ns: I64
-    pinhole_px: list[F64]
+    images: Images
     pairs: dict[Pair, TwoView]
 
 
@@ -63,13 +59,9 @@ class Solved:
 def given(part: I64, images: Images, pairs: Mapping[Pair, TwoView]) -> Given:
     """What a part's images (K,) are known by, and pairs of them."""
     place = {k: n for n, k in enumerate(part.tolist())}
-    return Given(
-        part,
-        [images.names[k] for k in place],
-        images.time_ns[part],
-        [images.pinhole_px[k] for k in place],
-        {(place[i], place[j]): view for (i, j), view in pairs.items()},
-    )
+    names, pixels = [images.names[k] for k in place], [images.pinhole_px[k] for k in place]
+    within = {(place[i], place[j]): view for (i, j), view in pairs.items()}
+    return Given(part, Images(names, images.time_ns[part], [], pixels), within)
 
 
 def solve(
@@ -98,10 +90,9 @@ def _solved(
     part: Given, camera: Camera, settings: MappingSettings, threads: int, folder: Path
 ) -> Solved | None:
     folder.mkdir(parents=True, exist_ok=True)
-    images = Images(part.names, part.time_ns, [], part.pinhole_px)
     try:
         with progress.silent():  # the build counts parts
-            structure = reconstruct(images, part.pairs, camera, settings, threads, folder)
+            structure = reconstruct(part.images, part.pairs, camera, settings, threads, folder)
     except MapError:  # images that only turn, or show one plane: no part of a map
         return None
     model = colmap.to_arrays(structure.reconstruction)
@@ -119,13 +110,13 @@ def _solved(
 
 def _write(path: Path, solved: Solved) -> None:
     with files.replacing(path) as part, part.open("wb") as file:
-        np.savez(file, **{name: getattr(solved, name) for name in _ARRAYS})
+        np.savez(file, **vars(solved))
 
 
 def _read(path: Path) -> Solved | None:
     """What was written there; None where there is nothing whole."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            return Solved(*(arrays[name] for name in _ARRAYS))
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return Solved(**arrays)
+    except (OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile):
         return None
