@@ -46,7 +46,7 @@ def adjust(
     graph: Graph,
     map_: Map,
     settings: MappingSettings,
-    on_round: Callable[[], None] = lambda: None,
+    on_round: Callable[[], None],
 ) -> Graph:
     """The graph at its optimum, in the datum of the map, without what does not fit.
 
@@ -54,17 +54,12 @@ def adjust(
     flights' frames that lose most of theirs, and landmarks that have too few left where they had
     enough. Raises `MapError` when nothing is left.
     """
-    camera, sfm = map_.info.camera, settings.sfm
+    sfm = settings.sfm
     weak_before, observations_before = _weak(graph, settings), _observations(graph)
 
     def solve(graph: Graph) -> Graph:
-        return graphs.solve(
-            _weighted(graph, settings.refine.correlation),
-            camera,
-            loss_px=sfm.loss_px,
-            threads=settings.threads,
-            on_round=on_round,
-        )
+        weighted = _weighted(graph, settings.refine.correlation)
+        return graphs.solve(weighted, settings, on_round)
 
     graph = solve(_without_hopeless(graph))
     graph = graphs.drop(graph, graph.error_px() > _gate_px(graph, sfm.max_error_px))

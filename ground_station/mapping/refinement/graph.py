@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ground_station.arrays import F64, I64, Bools
-from ground_station.geometry.camera import Camera
 from ground_station.map import colmap, landmarks
-from ground_station.map.model import Model
+from ground_station.map.model import Model, model_of
 from ground_station.map.store import Map
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.refinement.chosen import Chosen
+from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm import adjustment, models
 
 _ROUND_STEPS, _MOST_ROUNDS = 10, 10
@@ -53,25 +53,20 @@ def build_graph(map_: Map, pixel_px: F64, group: I64, flights: Sequence[Chosen])
 
     The map's observations are at `pixel_px` (O, 2), undistorted, and its K keyframes belong to
     `group` (K,); every flight becomes a group of its own."""
-    camera, lm, kf = map_.info.camera, map_.landmarks, map_.keyframes
+    own, kf = model_of(map_), map_.keyframes
     starts = len(kf) + np.concatenate([[0], np.cumsum([len(f) for f in flights])]).astype(np.int64)
-    names = list(kf.names)
-    for flight in flights:
-        names += [f"{flight.name}/{time_ns}" for time_ns in flight.time_ns.tolist()]
-    image = [np.repeat(np.arange(len(kf)), np.diff(kf.offset))]
-    image += [f.frame + start for f, start in zip(flights, starts, strict=False)]
-    observations = np.concatenate(image)
-    model = Model(
-        names=names,
-        image_id=np.arange(len(names)) + 1,
-        wTc=np.concatenate([kf.wTc, *(f.wTc for f in flights)]),
-        point_id=lm.id,
-        position=np.array(lm.position_m),
-        image=observations,
-        feature=np.zeros(len(observations), np.int64),
-        point=np.concatenate([kf.landmark, *(f.landmark for f in flights)]).astype(np.int64),
+    names = [f"{f.name}/{time_ns}" for f in flights for time_ns in f.time_ns.tolist()]
+    frames = [f.frame + start for f, start in zip(flights, starts, strict=False)]
+    image = np.concatenate([own.image, *frames])
+    model = replace(
+        own,
+        names=own.names + names,
+        image_id=np.arange(len(own.names) + len(names)) + 1,
+        wTc=np.concatenate([own.wTc, *(f.wTc for f in flights)]),
+        image=image,
+        feature=np.zeros(len(image), np.int64),
+        point=np.concatenate([own.point, *(f.landmark for f in flights)]),
         pixel_px=np.concatenate([pixel_px, *(f.pixel_px for f in flights)]),
-        camera=camera,
     )
     first = int(group.max(initial=0)) + 1
     groups = [group, *(np.full(len(f), first + k) for k, f in enumerate(flights))]
@@ -85,18 +80,12 @@ def keyframe_pixels(map_: Map, gap_s: float) -> tuple[F64, int]:
     """A map's observations without the readout's shift (O, 2), and how many keyframes that
     concerns, as `shutter.shifts_px`.
     """
-    camera, lm, kf = map_.info.camera, map_.landmarks, map_.keyframes
-    image = np.repeat(np.arange(len(kf)), np.diff(kf.offset))
+    own, kf = model_of(map_), map_.keyframes
+    points, seen_px = own.position[own.point], kf.pixel_px.astype(np.float64)
     shift, count = shutter.shifts_px(
-        kf.time_ns,
-        kf.wTc,
-        camera,
-        gap_s,
-        image,
-        lm.position_m[kf.landmark],
-        kf.pixel_px.astype(np.float64),
+        kf.time_ns, kf.wTc, own.camera, gap_s, own.image, points, seen_px
     )
-    return camera.undistort_to_pinhole(kf.pixel_px) - shift, count
+    return own.pixel_px - shift, count
 
 
 def drop(graph: Graph, bad: Bools) -> Graph:
@@ -126,26 +115,19 @@ def spread_px(graph: Graph) -> F64:
     return np.maximum(_MAD_TO_SIGMA * np.array(median), _LEAST_SIGMA_PX)
 
 
-def solve(
-    graph: Graph,
-    camera: Camera,
-    *,
-    loss_px: float,
-    threads: int,
-    on_round: Callable[[], None] = lambda: None,
-) -> Graph:
+def solve(graph: Graph, settings: MappingSettings, on_round: Callable[[], None]) -> Graph:
     """The graph with all poses and points at the optimum, in free gauge.
 
-    A Cauchy loss of scale `loss_px`, in pixels of the first group; the other groups' weigh by their
+    A Cauchy loss, whose scale is in pixels of the first group; the other groups' weigh by their
     standard deviations. `on_round` is called every few steps, between which Ctrl-C can stop it.
     """
     weight = graph.sigma_px[0] / graph.sigma_px[graph.group]
-    reconstruction = colmap.from_arrays(graph.model, camera, weight)
+    reconstruction = colmap.from_arrays(graph.model, graph.model.camera, weight)
     for _ in range(_MOST_ROUNDS):
         done = adjustment.adjust(
             reconstruction,
-            loss_px=loss_px,
-            threads=threads,
+            loss_px=settings.sfm.loss_px,
+            threads=settings.threads,
             max_iterations=_ROUND_STEPS,
         )
         on_round()

@@ -170,13 +170,7 @@ def _keyframe_observations(
     sigma = []
     for pixel_px in (seen_px, moved_px):
         graph = graphs.build_graph(map_, pixel_px, past.groups(len(map_.keyframes)), [])
-        graph = graphs.solve(
-            graph,
-            map_.info.camera,
-            loss_px=settings.sfm.loss_px,
-            threads=settings.threads,
-            on_round=on_round,
-        )
+        graph = graphs.solve(graph, settings, on_round)
         sigma.append(float(graphs.spread_px(graph)[0]))
     # Steady motion shears all observations alike, which a sheared model fits as well: then the
     # camera file is believed. It is not where the observations contradict it.
