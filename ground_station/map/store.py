@@ -169,11 +169,13 @@ _KEYFRAMES: Layout = {
 }
 
 
-def save_tables(folder: Path, map_: Map, *, quantise: bool = True) -> None:
+def save_tables(folder: Path, map_: Map) -> None:
     """Writes `map.toml`, `landmarks.safetensors` and `keyframes.safetensors` into a folder.
 
     Each is written beside and renamed; `map.toml` comes last, so a folder without it is no map.
+    Descriptors are quantised unless the settings that the map was built with say otherwise.
     """
+    quantise = bool(map_.info.built.get("settings", {}).get("quantise", True))
     lm, kf, info = map_.landmarks, map_.keyframes, map_.info
     arrays: dict[str, npt.NDArray[Any]] = {name: getattr(lm, name) for name in _LANDMARKS}
     observations: dict[str, npt.NDArray[Any]] = {name: getattr(kf, name) for name in _KEYFRAMES}

@@ -20,20 +20,21 @@ def _rows(count, dimension=32, signed=False, seed=0):
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
-def _with(built, modes):
-    return dataclasses.replace(built.map, modes=modes)
+def _with(built, modes, quantise=True):
+    info = dataclasses.replace(built.map.info, built={"settings": {"quantise": quantise}})
+    return dataclasses.replace(built.map, info=info, modes=modes)
 
 
 @pytest.mark.parametrize("quantise", [True, False])
 def test_modes_come_back_as_they_were_written(built, tmp_path, quantise):
     modes = Modes(np.array([3, 3, 8, 40], np.int32), _rows(4))
-    store.save_tables(tmp_path, _with(built, modes), quantise=quantise)
+    store.save_tables(tmp_path, _with(built, modes, quantise))
     again = store.load(tmp_path).modes
     assert np.array_equal(again.landmark, modes.landmark) and again.landmark.dtype == np.int32
     assert np.allclose(again.descriptor[:], modes.descriptor, atol=4e-3 if quantise else 1e-6)
     assert again.descriptor.values.itemsize == (1 if quantise else 4) or not quantise
     # Written again, nothing is lost.
-    store.save_tables(tmp_path / ".", store.load(tmp_path), quantise=quantise)
+    store.save_tables(tmp_path / ".", store.load(tmp_path))
     assert np.array_equal(store.load(tmp_path).modes.descriptor[:], again.descriptor[:])
 
 
@@ -96,8 +97,8 @@ def test_damaged_modes_are_refused_in_one_line(built, tmp_path, damage, words):
 def test_a_mode_that_is_not_a_number_is_refused(built, tmp_path):
     rows = _rows(2)
     rows[1, 3] = np.nan
-    store.save_tables(tmp_path, _with(built, Modes(np.array([1, 2], np.int32), rows)),
-                      quantise=False)  # fmt: skip
+    modes = Modes(np.array([1, 2], np.int32), rows)
+    store.save_tables(tmp_path, _with(built, modes, quantise=False))
     with pytest.raises(MapError, match="'mode_descriptor' holds a value that is not finite"):
         store.load(tmp_path)
 

@@ -75,7 +75,7 @@ def build(images: int, dask: int, settings: MappingSettings) -> Row:
         start_s = time.monotonic()
         map_ = assemble(model, given, CAMERA, settings, "campus")
         colmap.write(colmap.from_arrays(model, CAMERA), work / "sparse")
-        store.save_tables(work, map_, quantise=settings.quantise)
+        store.save_tables(work, map_)
         stage_s["write"] = time.monotonic() - start_s
     centres, truth = model.wTc[:, :3, 3], made.wTc[model.image_id - 1, :3, 3]
     off = np.linalg.norm(align(centres, truth, True).apply(centres) - truth, axis=1)

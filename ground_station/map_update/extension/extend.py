@@ -141,8 +141,7 @@ def extend_map(
             made.info.name = target.absolute().name
             carry_floorplan(folder, part)
         colmap.write(colmap.from_arrays(model_of(made), made.info.camera), part / "sparse")
-        quantise = bool(map_.info.built.get("settings", {}).get("quantise", True))
-        store.save_tables(part, made, quantise=quantise)
+        store.save_tables(part, made)
         report["bytes"] = [_bytes(folder), _bytes(part)]
         made.info.extended = _table(map_, {"of": content_id(folder), **report})
         store.save_info(part, made.info)

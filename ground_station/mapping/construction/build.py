@@ -173,7 +173,7 @@ def build_map(
             )
         colmap.write(sparse, folder / "sparse")
         colmap_files.check(folder / "sparse")  # COLMAP does not say when the disk is full
-        store.save_tables(folder, map_, quantise=settings.quantise)
+        store.save_tables(folder, map_)
         shutil.rmtree(folder / "work", ignore_errors=True)
     map_.folder = out
     return map_

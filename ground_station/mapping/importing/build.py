@@ -204,7 +204,7 @@ def import_model(
             "settings": asdict(settings),
         }
         colmap.write(colmap.from_arrays(found, camera), folder / "sparse")
-        store.save_tables(folder, map_, quantise=settings.quantise)
+        store.save_tables(folder, map_)
         shutil.rmtree(work)
     map_.folder = out
     return map_

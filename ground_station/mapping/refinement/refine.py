@@ -65,8 +65,7 @@ def refine_map(
             refined.info.name = target.absolute().name
             carry_floorplan(folder, part)
         colmap.write(colmap.from_arrays(model, map_.info.camera), part / "sparse")
-        quantise = bool(map_.info.built.get("settings", {}).get("quantise", True))
-        store.save_tables(part, refined, quantise=quantise)
+        store.save_tables(part, refined)
     refined.folder = target
     return refined, Refinement(report, kept)
 

@@ -140,10 +140,9 @@ def register_map(
     moved.info.frame, moved.info.units = found.frame, "m"
     moved.info.registration = {"source": source, "seed": seed, **report}
     colmap.transform(reconstruction, fit.scale, fit.rotation, fit.translation)
-    quantise = bool(map_.info.built.get("settings", {}).get("quantise", True))
     with replacing(folder) as part:
         colmap.write(reconstruction, part / "sparse")
-        store.save_tables(part, moved, quantise=quantise)
+        store.save_tables(part, moved)
     return moved, replace(found, report=report)
 
 
