@@ -133,19 +133,28 @@ class Structure:
         best = best[2 * votes[best] > total[track[best]]]
         self.landmark[:] = -1
         self.landmark[track[best]] = shown[best]
+        self.landmark[self._missed(self.landmark >= 0)] = -1
+
+    def _missed(self, chosen: Bools) -> Bools:
+        """Which of the chosen tracks (T,) most of their posed observations miss."""
         t = self.tracks
-        rows = np.flatnonzero(self.posed[t.frame] & (self.landmark[t.track] >= 0))
-        off = self._off_px(t.frame[rows], t.feature[rows], self.landmark[t.track[rows]])
+        rows = np.flatnonzero(self.posed[t.frame] & chosen[t.track])
+        off = self._off_px(t.frame[rows], t.feature[rows], self._keys()[t.track[rows]])
         seen = np.bincount(t.track[rows], minlength=t.count)
         fits = np.bincount(t.track[rows], off <= LOOSE_PX, t.count)
-        self.landmark[2 * fits < seen] = -1
+        return np.asarray(2 * fits < seen)
 
     # Observations and where they are
 
+    def _keys(self) -> I64:
+        """The key of each track's observations (T,)."""
+        count = len(self.map.landmarks)
+        return np.where(self.landmark >= 0, self.landmark, count + np.arange(self.tracks.count))
+
     def _observations(self) -> tuple[I64, I64, I64]:
         """Frame, feature and key of all observations of tracks and of landmarks without a track."""
-        t, count = self.tracks, len(self.map.landmarks)
-        key = np.where(self.landmark >= 0, self.landmark, count + np.arange(t.count))[t.track]
+        t = self.tracks
+        key = self._keys()[t.track]
         frame, feature, shown = (np.concatenate(rows) for rows in zip(*self._anchors, strict=True))
         alone = self._track_of[self.frames.offset[frame] + feature] < 0
         return (
@@ -260,14 +269,8 @@ class Structure:
 
     def forget_doubtful(self) -> None:
         """Takes the positions of tracks that most of their posed observations miss."""
-        t = self.tracks
         known = (self.landmark < 0) & np.isfinite(self.position).all(axis=1)
-        rows = np.flatnonzero(self.posed[t.frame] & known[t.track])
-        key = len(self.map.landmarks) + t.track[rows]
-        off = self._off_px(t.frame[rows], t.feature[rows], key)
-        seen = np.bincount(t.track[rows], minlength=t.count)
-        fits = np.bincount(t.track[rows], off <= LOOSE_PX, t.count)
-        self.position[2 * fits < seen] = np.nan
+        self.position[self._missed(known)] = np.nan
 
     def grow(self, on_frame: Callable[[], None] = lambda: None) -> int:
         """Poses frames that the localizer did not know, from what their neighbours see; how many.
@@ -298,10 +301,7 @@ class Structure:
         return k if known[k] >= self._settings.extend.min_observations else None
 
     def _known_of_unposed(self) -> tuple[I64, I64, I64]:
-        t = self.tracks
-        key = np.where(
-            self.landmark >= 0, self.landmark, len(self.map.landmarks) + np.arange(t.count)
-        )
+        t, key = self.tracks, self._keys()
         known = (self.landmark >= 0) | np.isfinite(self.position).all(axis=1)
         rows = np.flatnonzero(~self.posed[t.frame] & known[t.track])
         return t.frame[rows], t.feature[rows], key[t.track[rows]]
