@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import bisect
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtri
 
@@ -204,18 +205,9 @@ def _scatter(residual: F64, own: F64, freedom: float) -> float:
         return float(np.sum(squares / np.maximum(value + variance, 1e-300))) - freedom
 
     high = float(squares.sum()) / freedom  # with it, even without `own`, nothing is left over
-    low = 0.0
     if high == 0.0 or excess(0.0) <= 0:
         return 0.0
-    for _ in range(100):
-        middle = (low + high) / 2
-        if excess(middle) > 0:
-            low = middle
-        else:
-            high = middle
-        if high - low <= 1e-9 * high:
-            break
-    return high
+    return float(bisect(excess, 0.0, 2 * high, xtol=1e-12 * high, rtol=1e-12))
 
 
 def _vertical(upright: Upright, fit: Alignment, centre: F64) -> tuple[F64, F64]:

@@ -39,21 +39,22 @@ class PlanScale:
         if not all(math.isfinite(x) and abs(x) < 1e6 for x in self.origin):
             raise MapError(f"floor plan: its origin is {list(self.origin)}; finite numbers needed")
 
+    @property
+    def _turn(self) -> F64:
+        """The rotation (2, 2) from the plan's axes, x right and y up, to the world's."""
+        cosine, sine = math.cos(self.origin[2]), math.sin(self.origin[2])
+        return np.array([[cosine, -sine], [sine, cosine]])
+
     def to_world(self, pixels: npt.ArrayLike) -> F64:
         """Pixels (N, 2) to x, y in the world (N, 2), metres."""
         uv = np.asarray(pixels, np.float64).reshape(-1, 2)
         local = np.stack([uv[:, 0] + 0.5, self.height_px - 0.5 - uv[:, 1]], axis=1)
-        x, y, yaw = self.origin
-        cosine, sine = math.cos(yaw), math.sin(yaw)
-        turn = np.array([[cosine, -sine], [sine, cosine]])
-        return np.asarray(self.resolution_m * local @ turn.T + [x, y])
+        return np.asarray(self.resolution_m * local @ self._turn.T + self.origin[:2])
 
     def to_pixels(self, places: npt.ArrayLike) -> F64:
         """x, y in the world (N, 2), metres, to pixels (N, 2)."""
-        x, y, yaw = self.origin
-        cosine, sine = math.cos(yaw), math.sin(yaw)
-        turn = np.array([[cosine, -sine], [sine, cosine]])
-        local = (np.asarray(places, np.float64).reshape(-1, 2) - [x, y]) @ turn / self.resolution_m
+        xy = np.asarray(places, np.float64).reshape(-1, 2) - self.origin[:2]
+        local = xy @ self._turn / self.resolution_m
         return np.stack([local[:, 0] - 0.5, self.height_px - 0.5 - local[:, 1]], axis=1)
 
 
