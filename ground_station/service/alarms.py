@@ -103,31 +103,30 @@ def documents(alarms: Alarms) -> list[dict[str, Any]]:
 
 
 def _found(state: Mapping[str, Any], now_ns: int, standing: frozenset[str]) -> Iterator[Alarm]:
-    yield from _of_recording(state, standing)
+    if state["recording"] is not None:
+        limit_MB = state["station"]["min_free_MB"]
+        yield from _of_recording(state["recording"], limit_MB, standing)
     yield from _of_processes(state)
     yield from _of_maps(state, now_ns)
     yield from _of_unlisted(state, now_ns)
-    yield from _of_stations(_table(state, "fleet"))
+    if state["fleet"] is not None:
+        yield from _of_stations(state["fleet"])
     yield from _of_neighbours(state, standing)
-    for payload_id, view in _table(state, "payloads").items():
-        if not isinstance(view, dict):
-            continue
-        if _table(view, "payload").get("relayed") and view.get("alive"):
-            continue  # its own station does, and says it
-        if not view.get("alive"):
+    for payload_id, view in state["payloads"].items():
+        if not view["alive"]:
             yield from _of_gone(payload_id, view)
-            continue
-        yield from _of_flight(payload_id, view)
-        yield from _of_link(payload_id, view, standing)
-        yield from _of_board(payload_id, view, standing)
+        elif not view["payload"]["relayed"]:  # else its own station judges it, and says it
+            yield from _of_flight(payload_id, view)
+            yield from _of_link(payload_id, view, standing)
+            yield from _of_board(payload_id, view["payload"], standing)
 
 
 def _of_flight(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
-    alive_s = _number(view.get("alive_s")) or 0.0
-    age_s = _table(view, "age_s")
-    frame_s, estimate_s = _number(age_s.get("frame")), _number(age_s.get("estimate"))
+    alive_s, frame_s, estimate_s = (
+        view["alive_s"], view["age_s"]["frame"], view["age_s"]["estimate"]
+    )  # fmt: skip
     frames_come = frame_s is not None and frame_s <= NO_FRAMES_S
-    if not frames_come and (other := _table(view, "payload").get("station")):
+    if not frames_come and (other := view["payload"]["station"]):
         text = f"flies with station '{other}', which gets its video"
         yield Alarm(f"elsewhere/{payload_id}", INFO, payload_id, text)
     elif not frames_come and alive_s > NO_FRAMES_S:  # one that came just now gets a moment
@@ -136,164 +135,158 @@ def _of_flight(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
         if frame_s is None:  # telemetry comes through, and never any video
             text += ": a firewall? sudo blimp doctor looks"
         yield Alarm(f"no-frames/{payload_id}", ALARM, payload_id, text)
-    estimates_come = estimate_s is not None and estimate_s <= NO_FRAMES_S
-    estimate, state_s = _table(view, "estimate"), _number(view.get("state_s")) or 0.0
-    nothing_s = _number(view.get("nothing_known_s")) or 0.0
-    reason = str(estimate.get("reason") or "")
-    if estimates_come and nothing_s > NOTHING_KNOWN_S and not reason.startswith(NO_MAP):
-        text = f"nothing of the map {estimate.get('map')} has been recognised for {nothing_s:.0f} s"
-        yield Alarm(f"lost/{payload_id}", ALARM, payload_id, f"{text}: is it this building?")
-    elif estimates_come and estimate.get("state") == "LOST" and state_s > LOST_S:
-        text = f"LOST for {state_s:.0f} s" + (f": {reason}" if reason else "")
-        yield Alarm(f"lost/{payload_id}", ALARM, payload_id, text)
-    if estimates_come and (overload := str(estimate.get("overload") or "")):
-        yield Alarm(f"overload/{payload_id}", WARNING, payload_id, overload)
-    if frames_come and estimate_s is not None and min(estimate_s, alive_s) > NO_POSES_S:
+    if estimate_s is None:
+        return
+    if estimate_s <= NO_FRAMES_S:
+        yield from _of_estimate(payload_id, view)
+    if frames_come and min(estimate_s, alive_s) > NO_POSES_S:
         text = f"frames come, but none was localized for {estimate_s:.0f} s"
         yield Alarm(f"no-poses/{payload_id}", ALARM, payload_id, text)
 
 
+def _of_estimate(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
+    estimate, state_s, nothing_s = view["estimate"], view["state_s"], view["nothing_known_s"] or 0.0
+    reason = estimate["reason"]
+    if nothing_s > NOTHING_KNOWN_S and not reason.startswith(NO_MAP):
+        text = f"nothing of the map {estimate['map']} has been recognised for {nothing_s:.0f} s"
+        yield Alarm(f"lost/{payload_id}", ALARM, payload_id, f"{text}: is it this building?")
+    elif estimate["state"] == "LOST" and state_s > LOST_S:
+        text = f"LOST for {state_s:.0f} s" + (f": {reason}" if reason else "")
+        yield Alarm(f"lost/{payload_id}", ALARM, payload_id, text)
+    if overload := estimate["overload"]:
+        yield Alarm(f"overload/{payload_id}", WARNING, payload_id, overload)
+
+
 def _of_link(payload_id: str, view: Mapping[str, Any], standing: frozenset[str]) -> Iterator[Alarm]:
-    note = _table(view, "payload")
-    share, name = _number(note.get("lost_share")), f"radio/{payload_id}"
-    if share is not None and share > (LOSS_NO_MORE_HIGH if name in standing else LOSS_HIGH):
-        signal = _number(_table(note, "health").get("wifi_signal_dBm"))
+    note, name = view["payload"], f"radio/{payload_id}"
+    share = note["lost_share"]
+    if share > (LOSS_NO_MORE_HIGH if name in standing else LOSS_HIGH):
+        signal = (note["health"] or {}).get("wifi_signal_dBm")
         text = f"the radio loses {100 * share:.0f} % of the packets"
         text += f", at {signal:.0f} dBm" if signal is not None else ""
         yield Alarm(name, WARNING, payload_id, f"{text}: nearer to the access point?")
-    uncertain_ns = _number(_table(note, "clock").get("uncertainty_ns"))
-    limit_s = CLOCK_LOOSE_S * (CLOCK_OVER if f"clock/{payload_id}" in standing else 1.0)
-    if uncertain_ns is not None and uncertain_ns > 1e9 * limit_s:
-        text = f"the payload's clock is known to ±{1e-6 * uncertain_ns:.0f} ms only: slow network?"
-        yield Alarm(f"clock/{payload_id}", WARNING, payload_id, text)
-    unknown_s = _number(view.get("clock_unknown_s"))
+    name, unknown_s = f"clock/{payload_id}", view["clock_unknown_s"]
+    uncertain_s = 1e-9 * note["clock"]["uncertainty_ns"] if note["clock"] else 0.0
+    if uncertain_s > CLOCK_LOOSE_S * (CLOCK_OVER if name in standing else 1.0):
+        text = f"the payload's clock is known to ±{1e3 * uncertain_s:.0f} ms only: slow network?"
+        yield Alarm(name, WARNING, payload_id, text)
     if unknown_s is not None and unknown_s > CLOCK_UNKNOWN_S:
         text = "the payload's clock is not known: poses have no exact time"
-        yield Alarm(f"clock/{payload_id}", WARNING, payload_id, text)
+        yield Alarm(name, WARNING, payload_id, text)
 
 
 def _of_board(
-    payload_id: str, view: Mapping[str, Any], standing: frozenset[str]
+    payload_id: str, note: Mapping[str, Any], standing: frozenset[str]
 ) -> Iterator[Alarm]:
-    note = _table(view, "payload")
-    battery, health = _table(note, "battery"), _table(note, "health")
-    level = {ALARM_CRITICAL: ALARM, ALARM_LOW: WARNING}.get(str(battery.get("alarm")))
+    battery, health = note["battery"] or {}, note["health"] or {}
+    level = {ALARM_CRITICAL: ALARM, ALARM_LOW: WARNING}.get(battery.get("alarm", ""))
     if level is not None:
         text = "battery critical" if level == ALARM else "battery low"
-        voltage, share = _number(battery.get("voltage")), _number(battery.get("percentage"))
-        left_s = _number(battery.get("time_left_s"))
+        figures = (("voltage", 1, ".2f", "V"), ("percentage", 100, ".0f", "%"),
+                   ("time_left_s", 1 / 60, ".0f", "min left"))  # fmt: skip
         parts = [
-            *([f"{voltage:.2f} V"] if voltage is not None else []),
-            *([f"{100 * share:.0f} %"] if share is not None else []),
-            *([f"{left_s / 60:.0f} min left"] if left_s is not None else []),
+            f"{battery[key] * scale:{form}} {unit}"
+            for key, scale, form, unit in figures
+            if battery.get(key) is not None
         ]
         text += f": {', '.join(parts)}" if parts else ""
         yield Alarm(f"battery/{payload_id}", level, payload_id, text)
-    name = f"hot/{payload_id}"
-    celsius = _number(health.get("temperature_C"))
+    name, celsius = f"hot/{payload_id}", health.get("temperature_C")
     if celsius is not None and celsius > (NO_MORE_HOT_C if name in standing else HOT_C):
         text = f"the payload's processor has {celsius:.0f} °C"
         yield Alarm(name, WARNING, payload_id, text)
-    held = [str(one) for one in health.get("throttled") or () if not str(one).endswith(WAS)]
+    held = [one for one in health.get("throttled") or () if not one.endswith(WAS)]
     if held:
         text = f"the payload's board is held back: {', '.join(held)}"
         text += ": is its cell or its wiring too weak?" if UNDERVOLTAGE in held else ""
         yield Alarm(f"throttled/{payload_id}", WARNING, payload_id, text)
-    name = f"payload-disk/{payload_id}"
-    free_MB = _number(health.get("disk_free_MB"))
+    name, free_MB = f"payload-disk/{payload_id}", health.get("disk_free_MB")
     if health.get("recording") and _below(free_MB, DISK_WARNING_MB, name in standing):
         text = f"{free_MB:.0f} MB left on the payload's card, which records"
         yield Alarm(name, WARNING, payload_id, text)
 
 
 def _of_gone(payload_id: str, view: Mapping[str, Any]) -> Iterator[Alarm]:
-    gone_s = _number(view.get("gone_s"))
+    gone_s = view["gone_s"]
     if gone_s is None or gone_s > GONE_FOR_S:  # never here, or switched off for long
         return
     name = f"gone/{payload_id}"
-    if view.get("ended"):
+    if view["ended"]:
         yield Alarm(name, INFO, payload_id, "ended in order")
     else:
         yield Alarm(name, ALARM, payload_id, "gone: nothing is heard of the payload")
 
 
-def _of_recording(state: Mapping[str, Any], standing: frozenset[str]) -> Iterator[Alarm]:
-    recording = _table(state, "recording")
-    if recording.get("problem"):
+def _of_recording(
+    recording: Mapping[str, Any], limit_MB: float, standing: frozenset[str]
+) -> Iterator[Alarm]:
+    if recording["problem"]:
         yield Alarm("recording", ALARM, STATION, f"recording: {recording['problem']}")
-    resumed, lasts_s = recording.get("resumed"), _number(recording.get("duration_s")) or 0.0
-    if resumed and lasts_s < RESUMED_S:
-        yield Alarm("resumed", WARNING, STATION, f"recording: {resumed}")
-    free_MB = _number(recording.get("free_MB"))
+    if recording["resumed"] and recording["duration_s"] < RESUMED_S:
+        yield Alarm("resumed", WARNING, STATION, f"recording: {recording['resumed']}")
+    free_MB = recording["free_MB"]
     # It ends at the setting's limit: the warning comes before.
-    limit_MB = _number(_table(state, "station").get("min_free_MB")) or 0.0
-    limit_MB = limit_MB + max(limit_MB, DISK_WARNING_MB)
-    if recording.get("active") and _below(free_MB, limit_MB, "disk" in standing):
+    limit_MB += max(limit_MB, DISK_WARNING_MB)
+    if recording["active"] and _below(free_MB, limit_MB, "disk" in standing):
         yield Alarm("disk", WARNING, STATION, f"{free_MB:.0f} MB left on the recordings' disk")
 
 
 def _of_processes(state: Mapping[str, Any]) -> Iterator[Alarm]:
-    payloads = _table(state, "payloads")
-    for process in state.get("processes") or ():
-        name, age_s = str(process.get("name")), _number(process.get("age_s"))
+    payloads = state["payloads"]
+    for process in state["processes"]:
+        name, age_s, restarted_s = process["name"], process["age_s"], process["restarted_s"]
         kind, _, payload_id = name.partition("/")
         payload = payload_id if payload_id in payloads else STATION
-        # A localizer ends with its payload.
-        wanted = not payload_id or bool(_table(payloads, payload_id).get("alive"))
-        if wanted and age_s is not None and age_s > SILENT_S:
+        if payload_id and not (payload_id in payloads and payloads[payload_id]["alive"]):
+            continue  # a localizer ends with its payload
+        if age_s > SILENT_S:
             level = ALARM if kind in ("intake", "localizer") else WARNING
             text = f"the process {name} is silent for {age_s:.0f} s"
             yield Alarm(f"silent/{name}", level, payload, text)
-        restarted_s = _number(process.get("restarted_s"))
-        if wanted and restarted_s is not None and restarted_s < RESTARTED_S:
+        if restarted_s is not None and restarted_s < RESTARTED_S:
             yield Alarm(f"restarted/{name}", WARNING, payload, f"the process {name} was restarted")
 
 
 def _of_maps(state: Mapping[str, Any], now_ns: int) -> Iterator[Alarm]:
     refused: dict[str, Alarm] = {}
-    for event in state.get("events") or ():
-        time_ns = _number(event.get("time_ns"))
-        if event.get("name") != MAP_REFUSED or time_ns is None:
-            continue
-        if abs(now_ns - time_ns) < MAP_REFUSED_S * 1e9:
-            payload_id, text = str(event.get("payload")), str(event.get("text"))
-            level = ALARM if event.get("level") == ALARM else WARNING
-            refused[payload_id] = Alarm(f"map/{payload_id}", level, payload_id, text)
-    for payload_id, view in _table(state, "payloads").items():
+    for event in state["events"]:
+        if event["name"] == MAP_REFUSED and abs(now_ns - event["time_ns"]) < MAP_REFUSED_S * 1e9:
+            payload_id = event["payload"]
+            level = ALARM if event["level"] == ALARM else WARNING
+            refused[payload_id] = Alarm(f"map/{payload_id}", level, payload_id, event["text"])
+    for payload_id, view in state["payloads"].items():
         # A localizer without a map says so with its frames.
-        reason = str(_table(view, "estimate").get("reason") or "")
-        if reason.startswith(NO_MAP) and isinstance(view, dict) and view.get("alive"):
+        reason = view["estimate"]["reason"] if view["estimate"] else ""
+        if reason.startswith(NO_MAP) and view["alive"]:
             refused[payload_id] = Alarm(f"map/{payload_id}", ALARM, payload_id, reason)
     yield from refused.values()
 
 
 def _of_unlisted(state: Mapping[str, Any], now_ns: int) -> Iterator[Alarm]:
     # An intake that is started again says it again, where that is still so.
-    of_intake: Iterator[Mapping[str, Any]] = (
-        one for one in state.get("processes") or () if one.get("name") == "intake"
-    )
-    restarted_s = _number(next(of_intake, {}).get("restarted_s"))
-    since_ns = now_ns - 1e9 * (math.inf if restarted_s is None else restarted_s)
+    restarts_s = [one["restarted_s"] for one in state["processes"] if one["name"] == "intake"]
+    since_ns = max((now_ns - 1e9 * at_s for at_s in restarts_s if at_s is not None), default=0.0)
     said = [
         event
-        for event in state.get("events") or ()
-        if event.get("name") == UNLISTED and (_number(event.get("time_ns")) or 0.0) >= since_ns
+        for event in state["events"]
+        if event["name"] == UNLISTED and event["time_ns"] >= since_ns
     ]
-    newest = max(said, key=lambda event: _number(event.get("time_ns")) or 0.0, default=None)
-    if newest is not None and newest.get("level") == WARNING:
-        yield Alarm(UNLISTED, WARNING, STATION, str(newest.get("text")))
+    newest = max(said, key=lambda event: int(event["time_ns"]), default=None)
+    if newest is not None and newest["level"] == WARNING:
+        yield Alarm(UNLISTED, WARNING, STATION, newest["text"])
 
 
 def _of_neighbours(state: Mapping[str, Any], standing: frozenset[str]) -> Iterator[Alarm]:
     """Two blimps too near each other, whichever stations they fly with, in maps of one origin."""
-    limit_m = _number(_table(state, "station").get("apart_m")) or 0.0
-    where: dict[str, Any] = {}
-    for payload_id, view in _table(state, "payloads").items():
-        estimate, age_s = _table(view, "estimate"), _number(_table(view, "age_s").get("estimate"))
-        position_m = [_number(value) for value in estimate.get("position_m") or ()]
-        known = estimate.get("state") in ("TRACKING", "DEGRADED") and len(position_m) == 3
-        if known and None not in position_m and age_s is not None and age_s <= NO_FRAMES_S:
-            where[payload_id] = estimate.get("coordinates") or estimate.get("map"), position_m
+    limit_m = state["station"]["apart_m"]
+    where: dict[str, tuple[str, list[float]]] = {}
+    for payload_id, view in state["payloads"].items():
+        estimate, age_s = view["estimate"], view["age_s"]["estimate"]
+        if estimate is None or age_s > NO_FRAMES_S or estimate["position_m"] is None:
+            continue
+        if estimate["state"] in ("TRACKING", "DEGRADED"):
+            at = estimate["coordinates"] or estimate["map"]
+            where[payload_id] = at, estimate["position_m"]
     for one, other in itertools.combinations(sorted(where), 2):
         (ours, here), (theirs, there) = where[one], where[other]
         name, distance_m = f"near/{one}/{other}", math.dist(here, there)
@@ -302,7 +295,7 @@ def _of_neighbours(state: Mapping[str, Any], standing: frozenset[str]) -> Iterat
 
 
 def _of_stations(fleet: Mapping[str, Any]) -> Iterator[Alarm]:
-    for other in fleet.get("stations") or ():
+    for other in fleet["stations"]:
         name, age_s, clock_s = other["name"], other["age_s"], other["clock_s"]
         if age_s > SILENT_S:
             text = f"nothing is heard of station '{name}'"
@@ -317,27 +310,16 @@ def _of_stations(fleet: Mapping[str, Any]) -> Iterator[Alarm]:
                 f"station '{name}' flies in another map, '{other['map']}': its poses are not shown"
             )
             yield Alarm(f"station-map/{name}", INFO, STATION, text)
-    for offer in fleet.get("offers") or ():
+    for offer in fleet["offers"]:
         station, name = offer["station"], offer["map"]
         text = f"station '{station}' has '{name}', this map with {offer['more']} landmarks more"
         yield Alarm(f"station-offers/{station}/{name}", INFO, STATION, f"{text}: Map… (M)")
-    for payload_id, name in _table(fleet, "twins").items():
+    for payload_id, name in fleet["twins"].items():
         text = f"two payloads have this name: one flies here, one with station '{name}'"
         yield Alarm(f"twin/{payload_id}", ALARM, payload_id, text)
-    for text in fleet.get("refused") or ():
+    for text in fleet["refused"]:
         yield Alarm(f"refused/{text[:80]}", WARNING, STATION, f"not joined: {text}")
 
 
 def _below(value: float | None, limit: float, stands: bool) -> bool:
     return value is not None and value < limit * (DISK_OVER if stands else 1.0)
-
-
-def _table(of: Any, name: str) -> dict[str, Any]:
-    value = of.get(name) if isinstance(of, Mapping) else None
-    return value if isinstance(value, dict) else {}
-
-
-def _number(value: Any) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return None
-    return float(value)

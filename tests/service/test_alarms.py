@@ -44,6 +44,7 @@ def ids(snapshot: Snapshot) -> dict[str, str]:
 
 
 P = station.PAYLOAD
+ALONE: dict[str, Any] = {"stations": [], "offers": [], "twins": {}, "refused": []}
 
 
 def test_a_station_that_flies_has_none(told):
@@ -57,7 +58,7 @@ def test_a_station_that_flies_has_none(told):
         ({"alarm": "critical", "voltage": 3.3, "percentage": 0.04}, {f"battery/{P}": "alarm"}),
         ({"alarm": ""}, {}),
         ({"alarm": "of a newer payload"}, {}),
-        ({"alarm": "low", "voltage": None, "percentage": "x"}, {f"battery/{P}": "warning"}),
+        ({"alarm": "low", "voltage": None, "percentage": None}, {f"battery/{P}": "warning"}),
     ],
 )
 def test_a_battery(told, battery, found):
@@ -124,7 +125,6 @@ def test_ten_seconds_in_which_nothing_of_the_map_is_known_ask_for_the_building(t
         ({"lost_share": float("nan")}, False, ""),
         ({"clock": {"uncertainty_ns": 80_000_000}}, False, "known to ±80 ms only: slow network?"),
         ({"clock": {"uncertainty_ns": 8_000_000}}, True, ""),
-        ({"clock": {"uncertainty_ns": "x"}}, False, ""),
     ],
 )
 def test_a_bad_link_names_what_is_bad(told, link, standing, text):
@@ -175,7 +175,7 @@ def test_another_station_has_its_words(told, other, name, text):
         "name": "attic", "map": "hall", "same_map": True, "age_s": 0.2, "clock_s": 0.1,
         "payloads": [], **other,
     }  # fmt: skip
-    fleet = {"stations": [seen], "twins": {}, "refused": []}
+    fleet = {**ALONE, "stations": [seen]}
     found = alarms.judge({**told[0].document(), "fleet": fleet}, 0, {})
     assert set(found) == ({name} if name else set())
     assert all(text in item.alarm.text for item in found.values())
@@ -183,7 +183,7 @@ def test_another_station_has_its_words(told, other, name, text):
 
 def test_a_map_that_grew_elsewhere_is_offered(told):
     offers = [{"station": "attic", "map": "hall-2", "more": 500}]
-    found = alarms.judge({**told[0].document(), "fleet": {"offers": offers}}, 0, {})
+    found = alarms.judge({**told[0].document(), "fleet": {**ALONE, "offers": offers}}, 0, {})
     (item,) = found.values()
     assert (
         item.alarm.text
@@ -192,7 +192,7 @@ def test_a_map_that_grew_elsewhere_is_offered(told):
 
 
 def test_twins_and_whoever_was_refused_are_named(told):
-    fleet = {"stations": [], "twins": {P: "attic"}, "refused": ["ground.yard wants to join"]}
+    fleet = {**ALONE, "twins": {P: "attic"}, "refused": ["ground.yard wants to join"]}
     found = alarms.judge({**told[0].document(), "fleet": fleet}, 0, {})
     assert [item.alarm.text for item in found.values()] == [
         "two payloads have this name: one flies here, one with station 'attic'",
@@ -446,16 +446,3 @@ def test_the_gravest_come_first(told):
     snapshot.recording("-", station.recording(problem="slow disk"))
     documents = alarms.documents(alarms.judge(snapshot.document(), 0, {}))
     assert [item["level"] for item in documents] == ["alarm", "warning"]
-
-
-@pytest.mark.parametrize(
-    "state",
-    [
-        {},
-        {"payloads": None, "processes": None, "events": None, "recording": 5},
-        {"payloads": {"x": None}, "processes": [{}], "events": [{}]},
-        {"payloads": {"x": {"alive": True, "payload": 3, "age_s": [], "estimate": "no"}}},
-    ],
-)
-def test_a_state_of_another_shape_raises_nothing(state):
-    alarms.judge(state, 0, {})
