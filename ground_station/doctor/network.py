@@ -22,7 +22,7 @@ from ground_station.service.web import access
 from ground_station.stream.udp import BUFFER_BYTES
 from pi_firmware.wire import scouting
 from pi_firmware.wire.errors import TelemetryError
-from pi_firmware.wire.telemetry import check_endpoint
+from pi_firmware.wire.telemetry import check_endpoint, is_loopback
 
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 _SCOUTING_GROUP, _SCOUTING_PORT = "224.0.0.224", 7446
@@ -74,9 +74,9 @@ def reach(settings: StationSettings) -> Finding:
     hosts = [settings.video.host] + [
         port.host for port in ports_of(settings) if port.setting == "telemetry.listen"
     ]
-    if all(map(access.is_loopback, hosts)):
+    if all(map(is_loopback, hosts)):
         return ok("reach", f"this computer only (loopback); {TO_THE_NETWORK}")
-    if any(map(access.is_loopback, hosts)):
+    if any(map(is_loopback, hosts)):
         found = "video and telemetry are not both heard beyond loopback"
         return warning(
             "reach", found, f"set video.host and telemetry.listen alike; {TO_THE_NETWORK}"
@@ -155,7 +155,7 @@ def receive_buffer(limit: Path = _RMEM_MAX) -> Finding:
 
 def firewall_rules(settings: StationSettings) -> Finding:
     """Whether a firewall may drop what comes from outside."""
-    outside = [port for port in ports_of(settings) if not access.is_loopback(port.host)]
+    outside = [port for port in ports_of(settings) if not is_loopback(port.host)]
     interface = settings.telemetry.discoverable
     if interface and interface != scouting.LOOPBACK_INTERFACE:
         group = Port("discoverable", socket.SOCK_DGRAM, _SCOUTING_GROUP, _SCOUTING_PORT)

@@ -13,9 +13,9 @@ from ground_station.doctor.findings import Finding, ok, problem, warning
 from ground_station.errors import GroundStationError
 from ground_station.service import lan
 from ground_station.service.settings import MapSettings, StationSettings
-from ground_station.service.web.access import is_loopback
 from pi_firmware.wire import credentials
 from pi_firmware.wire.errors import BlimpError
+from pi_firmware.wire.telemetry import is_loopback
 
 _SOON = datetime.timedelta(days=30)
 

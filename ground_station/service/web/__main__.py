@@ -33,9 +33,10 @@ async def _serve(folder: Path) -> None:
     from ground_station.service import processes
     from ground_station.service.bus import Bus
     from ground_station.service.settings import load_run
-    from ground_station.service.web.access import is_loopback, read_token
+    from ground_station.service.web.access import read_token
     from ground_station.service.web.app import build
     from ground_station.service.web.server import complain, listen, server
+    from pi_firmware.wire.telemetry import is_loopback
 
     run = load_run(folder)
     http = run.station.http

@@ -27,6 +27,7 @@ from pathlib import Path
 
 from ground_station.errors import GroundStationError
 from ground_station.service.settings import HttpSettings
+from pi_firmware.wire.telemetry import is_loopback
 
 COOKIE = "blimp_session"
 SESSION_S = 12 * 3600
@@ -49,16 +50,6 @@ class Refused(Exception):
     def __init__(self, status: int, detail: str, retry_s: int | None = None) -> None:
         super().__init__(detail)
         self.status, self.detail, self.retry_s = status, detail, retry_s
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches an address or name."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def read_token(settings: HttpSettings) -> str | None:

@@ -29,11 +29,11 @@ from ground_station.service.bus_messages import (
 )
 from ground_station.service.fleet.fleet import Fleet
 from ground_station.service.settings import Run
-from ground_station.service.web.access import is_loopback
 from ground_station.service.web.trail import Trail
 from pi_firmware.wire import messages
 from pi_firmware.wire.errors import BlimpError, TelemetryError
 from pi_firmware.wire.keys import check_payload_id
+from pi_firmware.wire.telemetry import is_loopback
 
 EVENTS, EVENTS_SHOWN, PAYLOADS, PROCESSES = 500, 200, 32, 32
 POINTS = 300
