@@ -74,6 +74,14 @@ class VideoSettings:
     port: int = key(video.PORT, low=0, high=65535)
 
 
+def _check_endpoints(endpoints: Iterable[str], of: str, certified: bool) -> None:
+    try:
+        for endpoint in endpoints:
+            check_endpoint(endpoint, certified=certified)
+    except TelemetryError as error:
+        raise ValueError(str(error).replace("telemetry", of, 1)) from None
+
+
 @dataclass(frozen=True)
 class TelemetrySettings:
     """Zenoh with the payloads."""
@@ -84,11 +92,7 @@ class TelemetrySettings:
     discoverable: str = ""
 
     def __post_init__(self) -> None:
-        for endpoint in (*self.listen, *self.connect):
-            try:
-                check_endpoint(endpoint, certified=bool(self.certificates))
-            except TelemetryError as error:
-                raise ValueError(str(error)) from None
+        _check_endpoints((*self.listen, *self.connect), "telemetry", bool(self.certificates))
 
 
 @dataclass(frozen=True)
@@ -99,11 +103,7 @@ class FleetSettings:
     join: list[str] = key([])
 
     def __post_init__(self) -> None:
-        for endpoint in (*self.listen, *self.join):
-            try:
-                check_endpoint(endpoint, certified=True)
-            except TelemetryError as error:
-                raise ValueError(str(error).replace("telemetry", "fleet", 1)) from None
+        _check_endpoints((*self.listen, *self.join), "fleet", certified=True)
 
 
 @dataclass(frozen=True)
