@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import math
 import shlex
-import signal
-import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.geometry.camera import load_camera
     from ground_station.service import lan, settings
     from ground_station.service.bus_messages import STATION, EventMessage, PayloadMessage
+    from ground_station.service.ending import ending
     from ground_station.service.intake.process import Intake
 
     if args.seconds is not None and not (math.isfinite(args.seconds) and args.seconds > 0):
@@ -60,17 +58,14 @@ def run(args: argparse.Namespace) -> int:
     overrides = [*args.set]
     if args.port is not None:
         overrides.append(f"video.port={args.port}")
-    loaded = settings.load(args.config, overrides)
     if args.out is not None:
-        recording = dataclasses.replace(loaded.recording, folder=str(args.out))
-        loaded = dataclasses.replace(loaded, recording=recording)
+        overrides.append(f"recording.folder={args.out}")
+    loaded = settings.load(args.config, overrides)
     if args.lan is not None:
         loaded = lan.announced(loaded, args.lan)
     path = args.camera or loaded.map.camera
     camera = load_camera(path) if path else None
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
+    stop = ending(None)
     accounts: dict[str, dict[str, int]] = {}
 
     def take(_: str, payload_id: str, note: Message) -> None:

@@ -47,10 +47,12 @@ def run(args: argparse.Namespace) -> int:
     from ground_station.service.processes import ServiceError
     from ground_station.service.serve import check, serve
 
-    loaded = settings.load(args.config, args.set)
+    overrides = [*args.set]
     if args.map is not None:
-        folder = dataclasses.replace(loaded.map, folder=str(args.map))
-        loaded = dataclasses.replace(loaded, map=folder)
+        overrides.append(f"map.folder={args.map}")
+    elif args.demo and args.config is None:
+        overrides += [f"map.folder={settings.SAMPLE}", f"map.shelf={settings.SAMPLE.parent}"]
+    loaded = settings.load(args.config, overrides)
     if args.lan is not None:
         if args.demo:
             raise InputError("--demo plays over loopback only; leave out --demo or --lan")
@@ -63,11 +65,6 @@ def run(args: argparse.Namespace) -> int:
 
         folder = dataclasses.replace(loaded.map, folder=str(fetched(loaded)))
         loaded = dataclasses.replace(loaded, map=folder)
-    if args.demo and args.map is None and args.config is None:
-        shelf = dataclasses.replace(
-            loaded.map, folder=str(settings.SAMPLE), shelf=str(settings.SAMPLE.parent)
-        )
-        loaded = dataclasses.replace(loaded, map=shelf)
     if args.check:
         check(loaded)
         print("configuration is good")
