@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections import Counter
 
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocketClose
 
 from ground_station.service.web.access import Access, Refused, cookie_of
 
@@ -52,7 +54,7 @@ class Guard:
         except Refused as refused:
             if answer.begun:
                 raise
-            await self._refuse(scope, refused, answer)
+            await self._refuse(scope, receive, refused, answer)
         finally:
             known = method if method in (*_SAFE, "POST", "DELETE", "WS") else "other"
             self._answers[known, answer.status_class] += 1
@@ -71,27 +73,22 @@ class Guard:
             self._access.check_rate(address)
         scope.setdefault("state", {}).update(by=by, session=cookie_of(headers))
 
-    async def _refuse(self, scope: Scope, refused: Refused, answer: _Answer) -> None:
-        headers = [(b"content-type", b"application/json")]
-        status, body = refused.status, json.dumps({"detail": refused.detail}).encode()
-        if refused.retry_s is not None:
-            headers.append((b"retry-after", str(refused.retry_s).encode()))
-        if status == 401:
-            if scope["type"] == "http" and scope["method"] == "GET" and scope["path"] == "/":
-                status, headers, body = 303, [(b"location", b"/login")], b""
-            else:
-                headers.append((b"www-authenticate", b"Bearer"))
-        headers.append((b"content-length", str(len(body)).encode()))
-        if scope["type"] == "http":
-            headers.append((b"connection", b"close"))  # a body may still be on its way
-            kind = "http.response"
-        elif "websocket.http.response" in scope.get("extensions", {}):
-            kind = "websocket.http.response"
-        else:
-            await answer.send({"type": "websocket.close", "code": 1008})
+    async def _refuse(
+        self, scope: Scope, receive: Receive, refused: Refused, answer: _Answer
+    ) -> None:
+        is_http = scope["type"] == "http"
+        if not is_http and "websocket.http.response" not in scope.get("extensions", {}):
+            await WebSocketClose(1008)(scope, receive, answer.send)
             return
-        await answer.send({"type": f"{kind}.start", "status": status, "headers": headers})
-        await answer.send({"type": f"{kind}.body", "body": body})
+        headers = {} if refused.retry_s is None else {"retry-after": str(refused.retry_s)}
+        response: Response = JSONResponse({"detail": refused.detail}, refused.status, headers)
+        if refused.status == 401:
+            response.headers["www-authenticate"] = "Bearer"
+            if is_http and scope["method"] == "GET" and scope["path"] == "/":
+                response = RedirectResponse("/login", 303)
+        if is_http:
+            response.headers["connection"] = "close"  # a body may still be on its way
+        await response(scope, receive, answer.send)
 
 
 class _Answer:
@@ -127,15 +124,12 @@ async def _whole_body(scope: Scope, receive: Receive) -> Receive:
     body = bytearray()
     try:
         async with asyncio.timeout(_BODY_S):
-            more = True
-            while more:
-                message = await receive()
-                if message["type"] != "http.request":
-                    break
-                body += message.get("body", b"")
-                more = message.get("more_body", False)
+            async for piece in Request(scope, receive).stream():
+                body += piece
                 if len(body) > BODY_BYTES:
                     raise Refused(413, f"the body has more than {BODY_BYTES} bytes")
+    except ClientDisconnect:
+        pass  # there is nobody to answer
     except TimeoutError:
         raise Refused(408, f"the body did not come within {_BODY_S:.0f} s") from None
     given = False
