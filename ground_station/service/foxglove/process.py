@@ -68,14 +68,13 @@ _MOST = 2000
 
 
 class Inbox:
-    """Tasks in their order, at most 2000, and the newest frame of each payload.
+    """Tasks in their order, at most 2000.
 
     Never blocks who puts: a full inbox loses its oldest task. Safe from any thread.
     """
 
     def __init__(self) -> None:
         self._tasks: deque[Task] = deque(maxlen=_MOST)
-        self._frames: dict[str, FrameMessage] = {}
         self._there = threading.Condition()
 
     def put(self, task: Task) -> None:
@@ -84,20 +83,13 @@ class Inbox:
             self._tasks.append(task)
             self._there.notify()
 
-    def frame(self, payload_id: str, note: FrameMessage) -> None:
-        """Leaves a payload's newest frame."""
-        with self._there:
-            self._frames[payload_id] = note
-            self._there.notify()
-
-    def take(self, timeout_s: float) -> tuple[list[Task], dict[str, FrameMessage]]:
+    def take(self, timeout_s: float) -> list[Task]:
         """All there is; waits for something to come."""
         with self._there:
-            self._there.wait_for(lambda: self._tasks or self._frames, timeout_s)
-            tasks, frames = list(self._tasks), self._frames
+            self._there.wait_for(lambda: self._tasks, timeout_s)
+            tasks = list(self._tasks)
             self._tasks.clear()
-            self._frames = {}
-            return tasks, frames
+            return tasks
 
 
 PAYLOADS, PLACES, EVENTS = 32, 64, 100
@@ -116,6 +108,7 @@ class Publishing(ServerListener):
         self._context = Context()
         self._payloads: dict[str, Payload] = {}
         self._newest: dict[str, EstimateMessage] = {}  # of payloads elsewhere, too
+        self._frames: dict[str, FrameMessage] = {}  # the newest of each payload
         self._flown: dict[str, str] = {}  # the map that each payload flies in
         self._events: deque[tuple[str, EventMessage]] = deque(maxlen=EVENTS)
         self._recording: tuple[RecordingMessage, int] | None = None
@@ -152,11 +145,8 @@ class Publishing(ServerListener):
         """Until `stop` is set."""
         while not stop.is_set():
             self._bus.heartbeat()
-            tasks, frames = self._inbox.take(_POLL_S)
-            for task in tasks:
+            for task in self._inbox.take(_POLL_S):
                 self._do(task)
-            for payload_id, note in frames.items():
-                self._do(functools.partial(self._take_frame, payload_id, note))
 
     def close(self) -> None:
         """Ends the server."""
@@ -178,9 +168,12 @@ class Publishing(ServerListener):
     def _hear_frame(self, payload_id: str, note: FrameMessage) -> None:
         known = self._payloads.get(payload_id)
         if known is None or known.wants(note):
-            self._inbox.frame(payload_id, note)
+            self._frames[payload_id] = note
+            self._inbox.put(functools.partial(self._take_frame, payload_id, note))
 
     def _take_frame(self, payload_id: str, note: FrameMessage) -> None:
+        if self._frames.get(payload_id) is not note:  # a newer one has come
+            return
         if payload := self._payload(payload_id):
             payload.frame(note)
 
@@ -238,6 +231,7 @@ class Publishing(ServerListener):
             del self._topics[topic.id]
         payload.close()
         self._flown.pop(gone, None)
+        self._frames.pop(gone, None)
         return True
 
     # What a new subscriber is told
@@ -272,7 +266,7 @@ class Publishing(ServerListener):
 
     def _follow(self, payload_id: str, name: str) -> None:
         """Shows another map where the first payload flies in another."""
-        if not isinstance(name, str) or not name or self._flown.get(payload_id) == name:
+        if not name or self._flown.get(payload_id) == name:
             return
         before = self._shown
         self._flown[payload_id] = name
