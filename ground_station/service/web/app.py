@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import mimetypes
-import os
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,12 +117,8 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     snapshot.evicted = metrics.forget
     metrics.viewers = lambda: viewers.viewers
     metrics.bus_dropped = lambda: bus.dropped
-    metrics.video = lambda: {
-        "encoded": video.encoded,
-        "skipped": video.skipped,
-        "gone": video.gone,
-        "failed": video.failed,
-    }
+    fates = ("encoded", "skipped", "gone", "failed")
+    metrics.video = lambda: {fate: getattr(video, fate) for fate in fates}
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -189,7 +184,7 @@ def _elsewhere(fleet: Fleet | None) -> Callable[[str], Elsewhere]:
 
 def _active_file(snapshot: Snapshot) -> str:
     note = snapshot.recording_note()
-    return os.path.basename(str(note.file)) if note is not None and note.active else ""  # noqa: PTH119
+    return note.file if note is not None and note.active else ""
 
 
 def static_files(static: Path) -> StaticFiles:
