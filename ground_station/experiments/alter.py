@@ -52,6 +52,12 @@ def _seen(frame: Frame, alteration: Alteration, time_s: float) -> U8:
     return image
 
 
+def told_ns(frame: Frame, alteration: Alteration, seed: int) -> int:
+    """The time that the localizer is told, in the clock of the frame's own: off by chance."""
+    off_s = alteration.stamp_error_s * np.random.default_rng((seed, frame.index)).standard_normal()
+    return frame.time_ns + round(1e9 * off_s)
+
+
 def is_dark(alteration: Alteration, time_s: float) -> bool:
     """Whether the lens is covered `time_s` after the flight's first frame."""
     return 0 <= time_s - alteration.dark_from_s < alteration.dark_s

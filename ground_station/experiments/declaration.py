@@ -100,6 +100,9 @@ class Alteration:
         0.0, "the lens is covered from then on", unit="s", low=0.0, high=3600
     )
     dark_s: float = config.key(0.0, "for so long; 0: never", unit="s", low=0.0, high=3600)
+    stamp_error_s: float = config.key(
+        0.0, "standard deviation of the frames' times", unit="s", low=0.0, high=0.1
+    )
     landmarks: float = config.key(
         1.0, "share of the map's landmarks that is there, drawn at random", low=0.01, high=1.0
     )

@@ -18,7 +18,7 @@ import numpy as np
 from ground_station.arrays import F64, U8
 from ground_station.errors import InputError
 from ground_station.evaluation import ate
-from ground_station.experiments.alter import altered, arrivals, scaled_camera
+from ground_station.experiments.alter import altered, arrivals, scaled_camera, told_ns
 from ground_station.experiments.declaration import Alteration
 from ground_station.experiments.maps import displacement
 from ground_station.experiments.material import Flown
@@ -125,20 +125,24 @@ def measure(
         extractor = extractor_for(map_.info, features)
         localizer = Localizer(map_, camera, extractor, settings, smoothing=True)
         if preset == "thesis":
-            first = next(iter(flight.frames)).time_ns
-            localizer.set_initial_pose(flight.truth.wTc[flight.truth.nearest(first)], first)
+            first = next(iter(flight.frames))
+            wTc = flight.truth.wTc[flight.truth.nearest(first.time_ns)]
+            localizer.set_initial_pose(wTc, told_ns(first, alteration, seed))
     lossy = alteration.packet_loss > 0 and flight.recording is not None
     arrived = arrivals(flight.units(), alteration.packet_loss, seed) if lossy else None
     start_ns = next(iter(flight.frames)).time_ns
     estimates: list[PoseEstimate] = []
     smoothed: list[Kinematics] = []
     step = _ALONE_EVERY if preset == "alone" and flight.recording is not None else 1
+    true_ns: dict[int, int] = {}
     for frame in itertools.islice(altered(flight.frames, alteration, arrived), 0, None, step):
-        estimates.append(
-            localizer.process(frame.time_ns, frame.image, frame.index, frame.exposure_s)
-        )
+        time_ns = told_ns(frame, alteration, seed)
+        true_ns[time_ns] = frame.time_ns
+        estimate = localizer.process(time_ns, frame.image, frame.index, frame.exposure_s)
+        estimates.append(replace(estimate, time_ns=frame.time_ns))
         smoothed += localizer.smoothed()
     smoothed += localizer.finish()
+    smoothed = [replace(state, time_ns=true_ns[state.time_ns]) for state in smoothed]
     tracking = [e for e in estimates if e.state is State.TRACKING and e.wTc is not None]
     off = [(e, error) for e in tracking if (error := _off(e, flight.truth)) is not None]
     right = [e.time_ns for e, error in off if _right(error)]

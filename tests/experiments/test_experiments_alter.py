@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ground_station.experiments.alter import PACKET_BYTES, altered, arrivals, is_dark, scaled_camera
+from ground_station.experiments.alter import (
+    PACKET_BYTES,
+    altered,
+    arrivals,
+    is_dark,
+    scaled_camera,
+    told_ns,
+)
 from ground_station.experiments.declaration import Alteration
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.recording.frames import Frame
@@ -33,6 +40,15 @@ def test_nothing_is_changed_without_an_alteration():
 def test_every_third_frame_keeps_its_index_and_time():
     seen = list(altered(frames(8), Alteration(every=3)))
     assert [(f.index, f.time_ns) for f in seen] == [(k, 10**9 + k * 10**8) for k in (0, 3, 6)]
+
+
+def test_a_frame_is_told_a_time_that_is_off_by_chance_and_by_the_same_in_each_run():
+    off = Alteration(stamp_error_s=0.002)
+    told = [told_ns(f, off, 7) - f.time_ns for f in frames(400)]
+    assert 1.8e6 < np.std(told) < 2.2e6 and abs(np.mean(told)) < 3e5
+    assert told == [told_ns(f, off, 7) - f.time_ns for f in frames(400)]
+    assert told != [told_ns(f, off, 8) - f.time_ns for f in frames(400)]
+    assert all(told_ns(f, Alteration(), 7) == f.time_ns for f in frames(4))
 
 
 def test_the_covered_lens_is_black_for_just_that_time():

@@ -34,6 +34,7 @@ level = "covered for, s"
 presets = ["default"]
 alter.dark_from_s = 0.5
 alter.dark_s = 1.0
+alter.stamp_error_s = 0.01
 """
 ONLY = '[default]\npresets = ["default"]\n'
 
@@ -77,6 +78,8 @@ def test_it_is_flown_mapped_and_localized_and_again_gives_the_same(flown, capfd)
     dark = covered["presets"]["default"]
     assert len(dark["runs"][0]["seen_s"]) == 10 and dark["runs"][0]["localized"] <= 6
     assert dark["gap_s"]["mean"] > 0.9
+    judged = dark["runs"][0]["series"]["time_s"]  # by the true times, whatever it was told
+    assert len(judged) == dark["runs"][0]["localized"] and judged == [round(t, 1) for t in judged]
     page = (flown / "out" / "report.html").read_text()
     assert "covered for, s" in page and "data:image/png" in page
 
