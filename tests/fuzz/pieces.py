@@ -98,6 +98,20 @@ def blocks(*parts: bytes) -> bytes:
     return b"".join(struct.pack("<H", len(part)) + part for part in parts)
 
 
+def with_a_line(picker: Picker, whole: bytes) -> bytes:
+    """A file with one of its lines exchanged for the input's rest; or that rest alone."""
+    which, lines = picker.number(1), whole.splitlines(keepends=True)
+    if which >= len(lines):
+        return picker.rest()
+    lines[which] = picker.rest() + b"\n"
+    return b"".join(lines)
+
+
+def under(head: bytes, data: bytes) -> bytes:
+    """The input as it is; one that begins with a 0 under a head that is right."""
+    return head + data[1:] if data[:1] == b"\0" else data
+
+
 _BRANCHING = 8
 """How deep lists of several values nest; lists of one go as deep as a parser may."""
 _ODD = (

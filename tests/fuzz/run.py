@@ -16,7 +16,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -150,18 +150,6 @@ def _reason(text: str, status: int | None) -> str:
 
 def _shown(path: Path) -> str:
     return str(path.relative_to(ROOT) if path.is_relative_to(ROOT) else path)
-
-
-def inputs(reader: Reader, folder: Path) -> Iterator[Path]:
-    """A reader's seeds, written into a folder, and its past findings."""
-    subprocess.run(
-        [sys.executable, str(HERE / "child.py"), "seeds", reader.name, str(folder)],
-        check=True,
-        cwd=ROOT,
-    )
-    yield from sorted(folder.iterdir())
-    if (REGRESSIONS / reader.name).is_dir():
-        yield from sorted((REGRESSIONS / reader.name).iterdir())
 
 
 _HEAD = (

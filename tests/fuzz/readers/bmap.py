@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 
-from pieces import Picker, refusing, scratch, stretch
+from pieces import Picker, refusing, scratch, stretch, with_a_line
 
 from deploy.errors import DeployError
 from deploy.flash import image
@@ -28,13 +28,7 @@ _MAP = b"""<?xml version="1.0" ?>
 
 def fuzz(data: bytes) -> None:
     """Stretches that are taken lie in the image, in order."""
-    picker = Picker(data)
-    which, lines = picker.number(1), _MAP.splitlines(keepends=True)
-    if which < len(lines):
-        lines[which] = picker.rest() + b"\n"
-        content = b"".join(lines)
-    else:
-        content = picker.rest()
+    content = with_a_line(Picker(data), _MAP)
     own = hashlib.sha256(content).hexdigest().encode()
     _FILE.write_bytes(content.replace(_SUM, own, 1))
     with refusing(DeployError):

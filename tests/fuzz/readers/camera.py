@@ -4,25 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import tomli_w
-from pieces import Picker, refusing, scratch, stretch
+from pieces import Picker, refusing, scratch, stretch, with_a_line
 
 from ground_station.errors import CameraError
 from ground_station.geometry.camera import Camera, load_camera
 
 _FILE = scratch("camera") / "camera.toml"
-_LINES = tomli_w.dumps(Camera().as_dict()).encode().splitlines(keepends=True)
+_WHOLE = tomli_w.dumps(Camera().as_dict()).encode()
 
 
 def fuzz(data: bytes) -> None:
     """One line of a camera's, or all of the file, is the input's."""
-    picker = Picker(data)
-    which = picker.number(1)
-    if which < len(_LINES):
-        lines = [*_LINES]
-        lines[which] = picker.rest() + b"\n"
-        _FILE.write_bytes(b"".join(lines))
-    else:
-        _FILE.write_bytes(picker.rest())
+    _FILE.write_bytes(with_a_line(Picker(data), _WHOLE))
     with refusing(CameraError):
         camera = load_camera(_FILE)
         assert np.isfinite(camera.matrix).all() and np.isfinite(camera.distortion).all()
@@ -31,7 +24,7 @@ def fuzz(data: bytes) -> None:
 def seeds() -> list[bytes]:
     """A whole one; numbers that are none; keys that nest."""
     return [
-        b"\xff" + b"".join(_LINES),
+        b"\xff" + _WHOLE,
         b"\2fx_px = nan",
         b"\2fx_px = 0x" + b"f" * 400,
         b"\2fx_px = [1]",

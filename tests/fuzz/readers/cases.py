@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
-from pieces import Picker, as_json, changed, refusing, scratch, stretch
+from pieces import Picker, as_json, changed, refusing, scratch, stretch, with_a_line
 
 from ground_station.replay.cases.case import load_case
 from ground_station.replay.cases.frames import COLUMNS, read_csv
@@ -18,7 +18,7 @@ _CASE, _GOLDEN = _FOLDER / "case.toml", _FOLDER / "golden.txt"
 (_FOLDER / "flight.mcap").touch()
 (_FOLDER / "map").mkdir()
 (_FOLDER / "map" / "map.toml").touch()
-_LINES = b"""\
+_WHOLE = b"""\
 title = "a case"
 recording = "flight.mcap"
 map = "map"
@@ -40,12 +40,15 @@ position_rmse_m_max = 0.1
 coverage_min = 0.5
 [kinds.image]
 rate_hz = 5
-""".splitlines(keepends=True)
-_TERMS = (
-    'accepted_by = "a"\naccepted_at = "2026-01-01T00:00:00+00:00"\n'
-    "tolerance_m = 0.1\ntolerance_deg = 1.0\nmissing_max = 0.1\n"
-).splitlines(keepends=True)
-_POSE = "1.5 1 2 3 0 0 0 1\n"
+"""
+_ACCEPTED = f"""\
+{MARK}accepted_by = "a"
+{MARK}accepted_at = "2026-01-01T00:00:00+00:00"
+{MARK}tolerance_m = 0.1
+{MARK}tolerance_deg = 1.0
+{MARK}missing_max = 0.1
+1.5 1 2 3 0 0 0 1
+""".encode()
 _ROW = ",".join(["1", "2", "3", "4", "5", "TRACKING", "", "0", *["0.5"] * 7, "0" * 32])
 _RUN = {
     "schema": SCHEMA, "title": "a run", "rate_hz": 10.0, "seed": 1, "stream": {"packets": 5},
@@ -61,17 +64,10 @@ def fuzz(data: bytes) -> None:
     how = picker.number(1) % 4
     with refusing(BlimpError):
         if how == 0:
-            which, lines = picker.number(1), [*_LINES]
-            if which < len(lines):
-                lines[which] = picker.rest() + b"\n"
-            _CASE.write_bytes(b"".join(lines) if which < len(lines) else picker.rest())
+            _CASE.write_bytes(with_a_line(picker, _WHOLE))
             load_case(_CASE)
         elif how == 1:
-            which, terms = picker.number(1), [line.encode() for line in _TERMS]
-            if which < len(terms):
-                terms[which] = picker.rest() + b"\n"
-            text = b"".join(MARK.encode() + line for line in terms) + _POSE.encode()
-            _GOLDEN.write_bytes(text if which < len(terms) else picker.rest())
+            _GOLDEN.write_bytes(with_a_line(picker, _ACCEPTED))
             assert np.isfinite(read_golden(_GOLDEN).poses.position_m).all()
         elif how == 2:
             rows = [",".join(COLUMNS), *[_ROW] * (picker.number(1) % 3)]
@@ -90,11 +86,11 @@ def fuzz(data: bytes) -> None:
 def seeds() -> list[bytes]:
     """One of each, with rows and keys that are none."""
     return [
-        b"\0\xff" + b"".join(_LINES),
+        b"\0\xff" + _WHOLE,
         b"\0\x0coutages = [[0x" + b"f" * 3800 + b"]]",
         b'\0\1recording = "a\\u0000b"',
-        b'\1\0accepted_by = "b"',
-        b"\1\2tolerance_m = nan",
+        b"\1\0" + MARK.encode() + b'accepted_by = "b"',
+        b"\1\2" + MARK.encode() + b"tolerance_m = nan",
         b"\2\1",
         b"\2\0" + _ROW.replace("0.5", "nan").encode() + b"\n",
         b"\2\0" + _ROW.replace("1,", "9" * 5000 + ",", 1).encode() + b"\n",
@@ -102,7 +98,7 @@ def seeds() -> list[bytes]:
         b"\3\0",
         b"\3\3" + json.dumps({**_RUN, "rate_hz": 1e300}).encode(),
         stretch((1, b"\0\xff"), (5000, b"a."), (1, b"b = 1")),
-        stretch((1, b"\1\1"), (3000, b"a."), (1, b"b = 1")),
+        stretch((1, b"\1\1" + MARK.encode()), (3000, b"a."), (1, b"b = 1")),
         stretch((1, b"\3\3"), (5000, b"[")),
         stretch((1, b"\2\0"), (2000, _ROW.encode() + b"\n")),
     ]

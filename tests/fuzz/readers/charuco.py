@@ -6,28 +6,21 @@ from dataclasses import asdict
 
 import numpy as np
 import tomli_w
-from pieces import Picker, refusing, scratch, stretch
+from pieces import Picker, refusing, scratch, stretch, with_a_line
 
 from ground_station.calibration.board import Board, load_board
 from pi_firmware.wire.errors import BlimpError
 
 _FILE = scratch("charuco") / "board.toml"
-_LINES = [
+_WHOLE = b"".join(
     tomli_w.dumps({key: value}, multiline_strings=False).replace("\n", " ").encode() + b"\n"
     for key, value in asdict(Board()).items()
-]
+)
 
 
 def fuzz(data: bytes) -> None:
     """One key of a board's, or all of the file, is the input's."""
-    picker = Picker(data)
-    which = picker.number(1)
-    if which < len(_LINES):
-        lines = [*_LINES]
-        lines[which] = picker.rest() + b"\n"
-        _FILE.write_bytes(b"".join(lines))
-    else:
-        _FILE.write_bytes(picker.rest())
+    _FILE.write_bytes(with_a_line(Picker(data), _WHOLE))
     with refusing(BlimpError):
         board = load_board(_FILE)
         points = board.points_m()
@@ -38,7 +31,7 @@ def fuzz(data: bytes) -> None:
 def seeds() -> list[bytes]:
     """A whole one; numbers that are none; many squares; keys that nest."""
     return [
-        b"\xff" + b"".join(_LINES),
+        b"\xff" + _WHOLE,
         b"\1square_mm = nan",
         b"\1square_mm = 0x" + b"f" * 400,
         b"\0squares = [40, 40]",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from pieces import refusing, scratch, stretch
+from pieces import refusing, scratch, stretch, under
 
 from ground_station.errors import MapError
 from ground_station.mapping.registration.distances import COLUMNS, read_distances
@@ -14,7 +14,7 @@ _HEAD = ",".join((*COLUMNS, "sigma_m")).encode() + b"\n"
 
 def fuzz(data: bytes) -> None:
     """Lengths that are taken are finite and have two ends."""
-    _FILE.write_bytes(_HEAD + data[1:] if data[:1] == b"\0" else data)
+    _FILE.write_bytes(under(_HEAD, data))
     with refusing(MapError):
         distances = read_distances(_FILE)
         count = len(distances.names)

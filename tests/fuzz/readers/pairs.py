@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from pieces import refusing, scratch, stretch
+from pieces import refusing, scratch, stretch, under
 
 from ground_station.errors import MapError
 from ground_station.mapping.registration.observations import COLUMNS, read_pairs
@@ -14,7 +14,7 @@ _HEAD = ",".join(COLUMNS).encode() + b"\n"
 
 def fuzz(data: bytes) -> None:
     """Observations that are taken are finite and of points that are there."""
-    _FILE.write_bytes(_HEAD + data[1:] if data[:1] == b"\0" else data)
+    _FILE.write_bytes(under(_HEAD, data))
     with refusing(MapError):
         observations = read_pairs(_FILE)
         assert np.isfinite(observations.world_m).all() and np.isfinite(observations.pixel_px).all()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pieces import Picker, refusing, scratch, stretch
+from pieces import Picker, refusing, scratch, stretch, with_a_line
 
 from hw.parts import load_parts
 from pi_firmware.wire.errors import BlimpError
@@ -17,13 +17,7 @@ _PART = (
 
 def fuzz(data: bytes) -> None:
     """A part with a line of it exchanged, or any file."""
-    picker = Picker(data)
-    which, lines = picker.number(1), _PART.splitlines(keepends=True)
-    if which < len(lines):
-        lines[which] = picker.rest() + b"\n"
-        _FILE.write_bytes(b"".join(lines))
-    else:
-        _FILE.write_bytes(picker.rest())
+    _FILE.write_bytes(with_a_line(Picker(data), _PART))
     with refusing(BlimpError):
         for part in load_parts(_FILE).values():
             if part.efficiency:

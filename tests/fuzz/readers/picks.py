@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from pieces import refusing, scratch, stretch
+from pieces import refusing, scratch, stretch, under
 
 from ground_station.errors import MapError
 from ground_station.mapping.registration.picks import read_picks
@@ -22,7 +22,7 @@ direction = [0.0, 0.0, 1.0]
 
 def fuzz(data: bytes) -> None:
     """Picks that are taken are finite, of landmarks, and the vertical is a unit vector."""
-    _FILE.write_bytes(_HEAD + data[1:] if data[:1] == b"\0" else data)
+    _FILE.write_bytes(under(_HEAD, data))
     with refusing(MapError):
         picks = read_picks(_FILE)
         assert abs(np.linalg.norm(picks.upright.direction) - 1) < 1e-9

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pieces import Picker, refusing, stretch
+from pieces import Picker, refusing, stretch, with_a_line
 
 from deploy.board import settings
 from deploy.errors import DeployError
@@ -45,10 +45,7 @@ def fuzz(data: bytes) -> None:
             made = settings.dump(settings.merged({}, document, Provisioning("a"), "/x"))
             assert settings.dump(settings.read(made.encode(), "it")) == made
         else:
-            lines = WHOLE.splitlines(keepends=True)
-            if which < len(lines):
-                lines[which] = picker.rest() + b"\n"
-            found = parse(b"".join(lines) if which < len(lines) else picker.rest())
+            found = parse(with_a_line(Picker(data), WHOLE))
             assert parse(render(found).encode()) == found
             if found.wifi is None or found.wifi.is_psk or not found.wifi.password:
                 assert wpa_supplicant_conf(found, _STORED).isascii()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from pieces import refusing, scratch, stretch
+from pieces import refusing, scratch, stretch, under
 
 from ground_station.errors import MapError
 from ground_station.mapping.registration.tags import read_tags
@@ -14,7 +14,7 @@ _HEAD = b'family = "36h11"\nsize_m = 0.4\n[[tag]]\n'
 
 def fuzz(data: bytes) -> None:
     """A tag that is taken has one known point or four, finite."""
-    _FILE.write_bytes(_HEAD + data[1:] if data[:1] == b"\0" else data)
+    _FILE.write_bytes(under(_HEAD, data))
     with refusing(MapError):
         tags = read_tags(_FILE)
         assert tags.places and tags.turn in range(4)
