@@ -22,7 +22,7 @@ CAMERA = replace(THESIS_CAMERA, readout_s=0.0)
 def small(monkeypatch: pytest.MonkeyPatch) -> partial[SimulationSettings]:
     """Settings of a film of which each picture is of another view, at rest."""
     monkeypatch.setattr(lighting, "_SKY_DIRECTIONS", 8)
-    return partial(SimulationSettings, texels_per_m=12.0, duration_s=28.0, rate_hz=1.0)
+    return partial(SimulationSettings, texels_per_m=12.0, duration_s=18.0, rate_hz=1.0)
 
 
 def test_a_camera_is_found_by_its_film_and_gone_by(

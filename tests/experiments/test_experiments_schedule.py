@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from ground_station.errors import InputError
+from ground_station.experiments import schedule
 from ground_station.experiments.declaration import Alteration, FlightDeclaration, MapSpec
 from ground_station.experiments.plan import FlightJob, LensJob, MapJob, Plan, RunJob
 from ground_station.experiments.schedule import carry_out
@@ -19,6 +20,14 @@ from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.mapping.settings import MappingSettings
 from tests.waiting import eventually
+
+
+@pytest.fixture(autouse=True)
+def imported_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers are forks of a process that has imported the program: each would take a second."""
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload([schedule.__name__, "cv2"])
+    monkeypatch.setattr(schedule.multiprocessing, "get_context", lambda _: server)
 
 
 def a_plan(runs=3):
@@ -193,15 +202,15 @@ def flown_by_a_process(folder: Path) -> None:
 
 
 def test_a_worker_does_not_outlive_a_schedule_that_is_killed(tmp_path):
-    schedule = multiprocessing.get_context("spawn").Process(
+    flying = multiprocessing.get_context("spawn").Process(
         target=flown_by_a_process, args=(tmp_path,)
     )
-    schedule.start()
+    flying.start()
     eventually((tmp_path / "pid").is_file, what="the worker")
     worker = int((tmp_path / "pid").read_text())
     assert Path(f"/proc/{worker}").exists()
-    schedule.kill()
-    schedule.join()
+    flying.kill()
+    flying.join()
 
     def gone() -> bool:
         try:

@@ -21,11 +21,11 @@ seeds = [3]
 duration_s = 2.0
 rate_hz = 5.0
 [default.map]
-images = 14
+images = 10
 seed = 3
 [default.map.flight]
 plan = "loop"
-duration_s = 7.0
+duration_s = 5.0
 rate_hz = 2.0
 [experiment.path]
 level = "covered for, s"
@@ -70,7 +70,7 @@ def test_it_is_flown_mapped_and_localized_and_again_gives_the_same(flown, capfd)
     whole, covered = first["experiments"][0]["cases"]
     for preset in ("thesis", "alone", "default"):
         row = whole["presets"][preset]
-        assert row["failed"] == [] and row["keyframes"] == 14 and row["landmarks"] > 300
+        assert row["failed"] == [] and row["keyframes"] == 10 and row["landmarks"] > 300
         assert row["localized"] >= 0.8 and row["position_m"]["mean"] < 0.15, row["position_m"]
     ours = whole["presets"]["default"]
     assert ours["position_m"]["mean"] < 0.05 and ours["consistency"]["inside_95"] > 0.5
@@ -90,7 +90,7 @@ def test_it_is_flown_mapped_and_localized_and_again_gives_the_same(flown, capfd)
     second, said = run(flown, capfd)
     (file,) = (flown / "out" / "maps").glob("*/map.toml")
     cache = tomllib.loads(file.read_text())["built"]["cache"]
-    assert (cache["features_found"], cache["features_made"]) == (14, 0)
+    assert (cache["features_found"], cache["features_made"]) == (10, 0)
     assert "experiments, jobs: 3 in" in said
     for one, other in zip(_runs(first), _runs(second), strict=True):
         assert one["localized"] == other["localized"]
