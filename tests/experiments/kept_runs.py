@@ -1,9 +1,17 @@
-"""Results of runs as the store keeps them, without a flight."""
+"""Results of runs as the store keeps them, without a flight; and the document of such runs."""
 
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
+
+from ground_station.experiments import declaration, summary
+from ground_station.experiments.plan import Plan
+from ground_station.experiments.store import Store
+
+Runs = dict[str, list[dict[str, Any] | None]]
+"""By preset, one for each seed; None: not measured."""
 
 
 def run(errors_m: list[float | None], *, seed: int = 0, step: int = 1) -> dict[str, Any]:
@@ -42,3 +50,19 @@ def run(errors_m: list[float | None], *, seed: int = 0, step: int = 1) -> dict[s
             "rotation_deg": [10 * e for e in errors],
         },
     }
+
+
+def document(folder: Path, text: str, runs: dict[tuple[str, str], Runs]) -> dict[str, Any]:
+    """Of a file of experiments with that text; `runs` by the names of experiment and case."""
+    path, store = folder / "e.toml", Store(folder / "store")
+    path.write_text(text)
+    keys: dict[tuple[str, str], dict[str, list[str]]] = {}
+    for row, presets in runs.items():
+        keys[row] = {}
+        for preset, found in presets.items():
+            keys[row][preset] = [f"{'-'.join(row)}-{preset}-{k}" for k in range(len(found))]
+            for key, one in zip(keys[row][preset], found, strict=True):
+                if one is not None:
+                    store.write(key, one)
+    about = {"machine": {"cores": 2, "date": "2026-11-27"}, "jobs": 2, "quick": False}
+    return summary.summarise(declaration.load(path), Plan({}, {}, keys), store, about)

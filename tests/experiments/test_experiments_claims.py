@@ -6,8 +6,6 @@ import kept_runs
 import pytest
 
 from ground_station.experiments import declaration, report, summary, tables
-from ground_station.experiments.plan import Plan
-from ground_station.experiments.store import Store
 from pi_firmware.wire.errors import ConfigError
 
 FLIGHTS = """seeds = [1, 2]
@@ -25,20 +23,10 @@ NOON, SUNSET = [0.01] * 4, [0.03] * 4
 
 def document(tmp_path, claim, sunset, noon=None):
     """Of two rows, of whose default two seeds have those runs; the thesis's were worse."""
-    path = tmp_path / "e.toml"
-    path.write_text(f"{FLIGHTS}{claim}\n")
-    declared, store, runs = declaration.load(path), Store(tmp_path / "store"), {}
-    noon = [kept_runs.run(NOON)] * 2 if noon is None else noon
+    runs = {"noon": [kept_runs.run(NOON)] * 2 if noon is None else noon, "sunset": sunset}
     theirs = [kept_runs.run([0.4] * 4)] * 2
-    for case, ours in (("noon", noon), ("sunset", sunset)):
-        runs["light", case] = {}
-        for preset, rows in (("thesis", theirs), ("default", ours)):
-            keys = [f"{case}{preset}{k}" for k in range(len(rows))]
-            runs["light", case][preset] = keys
-            for key, row in zip(keys, rows, strict=True):
-                store.write(key, row)
-    about = {"machine": {"cores": 2, "date": "2026-11-27"}, "jobs": 2, "quick": False}
-    return summary.summarise(declared, Plan({}, {}, runs), store, about)
+    rows = {("light", case): {"thesis": theirs, "default": ours} for case, ours in runs.items()}
+    return kept_runs.document(tmp_path, f"{FLIGHTS}{claim}\n", rows)
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,7 @@ import kept_runs
 import pytest
 
 from ground_station.errors import InputError
-from ground_station.experiments import declaration, report, summary
-from ground_station.experiments.plan import Plan
-from ground_station.experiments.store import Store
+from ground_station.experiments import declaration, report
 
 NEWER: set[str] = {
     *(f"hours.{hour}" for hour in (6, 9, 12, 15, 18, 21)), "age.moved-25", "age.moved-50",
@@ -24,21 +22,17 @@ ACCEPTED = declaration.SHIPPED.with_name(report.ACCEPTED)
 @pytest.fixture
 def document(tmp_path):
     """Of two experiments, one a series of levels."""
-    path = tmp_path / "e.toml"
-    path.write_text(
+    text = (
         'seeds = [1]\n[experiment.light]\ntitle = "Light"\n[experiment.light.case.noon]\n'
         'thesis.position_m = 0.2\n[experiment.blur]\nlevel = "px"\n[experiment.blur.case.2]\n'
     )
-    declared = declaration.load(path)
-    store = Store(tmp_path / "store")
-    runs = {}
-    for experiment, case in (("light", "noon"), ("blur", "2")):
-        for preset, error in (("thesis", 0.1), ("default", 0.01)):
-            last = None if (experiment, preset) == ("blur", "thesis") else error  # lost at the end
-            store.write(f"{experiment}{preset}", kept_runs.run([error, error, last]))
-        runs[experiment, case] = {p: [f"{experiment}{p}"] for p in ("thesis", "default")}
-    about = {"machine": {"date": "2026-11-27"}, "jobs": 2, "quick": False}
-    return summary.summarise(declared, Plan({}, {}, runs), store, about)
+    ours, theirs = kept_runs.run([0.01] * 3), kept_runs.run([0.1] * 3)
+    lost = kept_runs.run([0.1, 0.1, None])
+    runs = {
+        ("light", "noon"): {"thesis": [theirs], "default": [ours]},
+        ("blur", "2"): {"thesis": [lost], "default": [ours]},
+    }
+    return kept_runs.document(tmp_path, text, runs)
 
 
 def test_an_accepted_run_stands_in_readme_and_only_its_figures_there_are_kept(tmp_path, document):

@@ -8,27 +8,14 @@ import math
 import kept_runs
 import pytest
 
-from ground_station.bench.machine import machine
-from ground_station.experiments import declaration, report, summary, tables
-from ground_station.experiments.plan import Plan
+from ground_station.experiments import report, summary, tables
 from ground_station.experiments.store import Store
 
 
 def document(tmp_path, runs, thesis='thesis.position_m = 0.2\ncause = "it is dark"'):
     """Of one experiment with one case, whose presets have those runs."""
-    path = tmp_path / "e.toml"
     head = 'seeds = [1, 2]\n[experiment.light]\ntitle = "Light <b>"\n[experiment.light.case.noon]\n'
-    path.write_text(f"{head}{thesis}\n")
-    declared = declaration.load(path)
-    store = Store(tmp_path / "store")
-    keys = {preset: [f"{preset}{k}" for k in range(len(rows))] for preset, rows in runs.items()}
-    for preset, rows in runs.items():
-        for key, row in zip(keys[preset], rows, strict=True):
-            if row is not None:
-                store.write(key, row)
-    planned = Plan({}, {}, {("light", "noon"): keys})
-    about = {"machine": machine(), "jobs": 2, "quick": False}
-    return summary.summarise(declared, planned, store, about)
+    return kept_runs.document(tmp_path, f"{head}{thesis}\n", {("light", "noon"): runs})
 
 
 def test_figures_are_the_mean_and_the_sample_deviation_over_the_seeds(tmp_path):
