@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from ground_station.map import store
 from ground_station.recording.flight import trajectory_of
@@ -45,20 +44,15 @@ def listening(line: Path) -> Iterator[list[Any]]:
     poses += [message for message in vehicle.heard if message.get_type() in kinds]
 
 
-def test_poses_of_the_localizer_reach_the_autopilot(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_poses_of_the_localizer_reach_the_autopilot(tmp_path: Path) -> None:
     """They are where the truth is, in the autopilot's frame, and the payload hears of its link."""
+    line = tmp_path / "line"
     settings = replay.settings_for(
-        "default", SAMPLE / "flight.mcap", start_s=2.0, duration_s=3.0, rate_hz=10.0, stepped=True
-    )
-    config = replay._payload_config
-    with listening(tmp_path / "line") as told:
+        "default", SAMPLE / "flight.mcap", start_s=2.0, duration_s=3.0, rate_hz=10.0, stepped=True,
         # However slow the machine: a pose that came late is sent all the same.
-        autopilot = {"uri": f"serial:{tmp_path / 'line'}?baud=921600", "max_age_s": 5.0}
-        monkeypatch.setattr(
-            replay, "_payload_config", lambda *given: config(*given) | {"autopilot": autopilot}
-        )
+        payload=(f"autopilot.uri=serial:{line}?baud=921600", "autopilot.max_age_s=5"),
+    )  # fmt: skip
+    with listening(line) as told:
         result = replay.replay(store.load(SAMPLE), settings)
     localized = [frame for frame in result.live.frames if frame.estimate.localized]
     # The last ones meet a payload that has ended, on a slow machine more of them.
