@@ -55,18 +55,3 @@ def test_what_is_asked_for_and_has_no_data_ends_with_status_2(bench, tmp_path, c
     assert status == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert "data/illumination" in line
-
-
-@pytest.mark.parametrize(
-    "words, reason",
-    [
-        (("--max-features", "3"), "--max-features is 3; allowed: 50 to 20000"),
-        (("--threads", "99"), "--threads is 99"),
-        (("--repetitions", "1"), "--repetitions is 1"),
-        (("--extractors", "surf"), "no extractor 'surf' (known: "),
-    ],
-)
-def test_values_out_of_range_are_refused_in_one_line(bench, capsys, words, reason):
-    status, _ = bench(*words)
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert status == 2 and reason in line

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from ground_station import cli
-
 ATRIUM = Path(__file__).parents[2] / "maps/atrium"
 
 
@@ -67,19 +65,3 @@ def test_the_command_prints_and_writes_every_table(run):
     assert result["seed"] == 44 and result["machine"]["cores"] >= 1
     presets = result["frame"]["presets"]
     assert presets["default"]["localized"] == presets["thesis"]["localized"] == 4
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--frames", "1"], "--frames is 1; allowed: 2 to"),
-        (["--map", "nowhere"], "nowhere: there is no such map"),
-        (["--landmarks", "5", "4"], "100 <= 5 < 4"),
-    ],
-)
-def test_a_bad_value_is_one_line(arguments, said, capsys):
-    if "--map" not in arguments:
-        arguments = [*arguments, "--map", str(ATRIUM)]
-    assert cli.main(["bench", "localize", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1

@@ -112,10 +112,3 @@ def test_real_sets_that_are_missing_are_said_in_one_line_each(tmp_path, capsys):
         "kitchen: left out, no folder 'redkitchen' in --real",
     ]
     assert json.loads(told.read_text())["rows"] == []
-
-
-def test_a_set_that_there_is_not_is_refused_by_name(capsys):
-    assert cli.main(["bench", "map", "--study", "attic"]) == 2
-    assert (
-        "--study has 'attic'; allowed: atrium, office, corridor, stills" in capsys.readouterr().err
-    )

@@ -32,7 +32,6 @@ def write_comparison(path: str | Path, comparison: Comparison, a: str, b: str) -
         path,
         _TEMPLATES / "compare.html",
         title=f"{b} against {a}",
-        names=(a, b),
         comparison=c,
         lines=[
             (line.name, a_, b_, line.unit, *more, ("✗ " if line.fails else "") + line.told)
