@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
@@ -25,6 +26,19 @@ SMALL = (
 TAKES_AND_GIVES_NONE, DOES_NOT_COME_BACK = 1, 2
 HOPELESS = 3
 """Exit status by which systemd starts the process again."""
+
+
+@contextlib.contextmanager
+def streaming(
+    folder: Path, camera: str, *settings: str, env: Mapping[str, str] | None = None
+) -> Iterator[tuple[Ground, Flight]]:
+    """A flight with this camera, once it streams."""
+    with (
+        Ground(numbered=False) as ground,
+        Flight(folder, ground, None, *SMALL, *settings, camera=camera, env=env) as flight,
+    ):
+        flight.wait_streaming(LIMIT_S)
+        yield ground, flight
 
 
 def events_of(ground: Ground) -> list[str]:
@@ -58,12 +72,7 @@ def assert_accounted(account: Account) -> None:
 
 def fly_without_camera(folder: Path) -> tuple[Account, list[str]]:
     """A flight whose camera is gone for 3 s and must be seen again within 5 s of its return."""
-    uri = "test:?gone_at_s=5&gone_for_s=3"
-    with (
-        Ground(numbered=False) as ground,
-        Flight(folder, ground, None, *SMALL, camera=uri) as flight,
-    ):
-        flight.wait_streaming(30)
+    with streaming(folder, "test:?gone_at_s=5&gone_for_s=3") as (ground, flight):
         gone_s = wait_for_gap(flight, 1)
         flight.wait_streaming(gone_s + 3 + FRESH_S - time.monotonic())
         time.sleep(0.5)
@@ -81,12 +90,7 @@ def without_camera(
 
 
 def test_a_camera_that_hangs_is_opened_anew(tmp_path: Path) -> None:
-    uri = "test:?hang_at_s=3&hang_for_s=60"
-    with (
-        Ground(numbered=False) as ground,
-        Flight(tmp_path, ground, None, *SMALL, camera=uri) as flight,
-    ):
-        flight.wait_streaming(30)
+    with streaming(tmp_path, "test:?hang_at_s=3&hang_for_s=60") as (ground, flight):
         wait_for_gap(flight, 0.6)
         flight.wait_streaming()
         time.sleep(0.5)
@@ -99,11 +103,7 @@ def test_a_camera_that_hangs_is_opened_anew(tmp_path: Path) -> None:
 
 def test_an_encoder_that_gives_nothing_is_opened_anew(tmp_path: Path) -> None:
     encoder = Shim(tmp_path, "encoder_fault")
-    with (
-        Ground(numbered=False) as ground,
-        Flight(tmp_path, ground, None, *SMALL, camera="test:", env=encoder.env) as flight,
-    ):
-        flight.wait_streaming(30)
+    with streaming(tmp_path, "test:", env=encoder.env) as (ground, flight):
         encoder.set(TAKES_AND_GIVES_NONE)
         assert ground.listener.wait_for_event("blimp-1", messages.EVENT_ENCODER_RESTARTED, LIMIT_S)
         encoder.set(0)
@@ -121,11 +121,7 @@ def test_a_flight_that_ends_while_the_encoder_gives_nothing_accounts_for_what_it
     tmp_path: Path,
 ) -> None:
     encoder = Shim(tmp_path, "encoder_fault")
-    with (
-        Ground(numbered=False) as ground,
-        Flight(tmp_path, ground, None, *SMALL, camera="test:", env=encoder.env) as flight,
-    ):
-        flight.wait_streaming(30)
+    with streaming(tmp_path, "test:", env=encoder.env) as (_, flight):
         encoder.set(TAKES_AND_GIVES_NONE)
         time.sleep(0.4)  # not long enough to be noticed
         account = flight.finish()
@@ -148,12 +144,9 @@ def test_the_same_picture_for_ever_is_no_fresh_frame(tmp_path: Path) -> None:
 
 def test_a_lens_that_is_covered_is_no_camera_that_hangs(tmp_path: Path) -> None:
     dark = ("gate.heartbeat_s=0.2", "gate.enabled=true")
-    with Ground(numbered=False) as ground:
-        black = "test:?pattern=black"
-        with Flight(tmp_path, ground, None, *SMALL, *dark, camera=black) as flight:
-            flight.wait_streaming(LIMIT_S)
-            time.sleep(3.0)  # thrice the camera's limit
-            flight.finish().ended.assert_in_order()
+    with streaming(tmp_path, "test:?pattern=black", *dark) as (ground, flight):
+        time.sleep(3.0)  # thrice the camera's limit
+        flight.finish().ended.assert_in_order()
         assert messages.EVENT_CAMERA_RESTARTED not in events_of(ground)
 
 

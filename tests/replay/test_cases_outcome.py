@@ -44,6 +44,16 @@ def bits(table: frames.Frames) -> list[bytes]:
     return [c.tobytes() for c in columns if isinstance(c, np.ndarray)]
 
 
+def with_cells(path: Path, first: int, *texts: str) -> None:
+    """Writes a table of three frames, of whose second these cells are another's."""
+    frames.write_csv(path, stand.table([stand.row(k) for k in range(3)]))
+    lines = path.read_text().splitlines()
+    cells = lines[2].split(",")
+    cells[first : first + len(texts)] = texts
+    lines[2] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
+
+
 def test_a_folder_reads_back_as_it_was(tmp_path: Path) -> None:
     plan = FloorPlan(np.arange(48, dtype=np.uint8).reshape(6, 8), 0.5, (1.0, -2.0, 0.25))
     outage = Outage(stand.CLOCK_NS, stand.CLOCK_NS + 5, "gone")
@@ -127,12 +137,7 @@ def test_a_damaged_table_is_refused_by_its_line(
     tmp_path: Path, column: int, text: str, says: str
 ) -> None:
     path = tmp_path / "frames.csv"
-    frames.write_csv(path, stand.table([stand.row(k) for k in range(3)]))
-    lines = path.read_text().splitlines()
-    cells = lines[2].split(",")
-    cells[column] = text
-    lines[2] = ",".join(cells)
-    path.write_text("\n".join(lines) + "\n")
+    with_cells(path, column, text)
     with pytest.raises(BlimpError) as error:
         frames.read_csv(path)
     assert says in str(error.value) and "line 3" in str(error.value)
@@ -181,11 +186,7 @@ def test_a_result_that_is_none_is_refused_in_one_line(
 
 def test_a_quaternion_that_is_none_is_no_pose(tmp_path: Path) -> None:
     """As another's program, or a flipped bit, may have written it."""
-    frames.write_csv(tmp_path / "f.csv", stand.table([stand.row(k) for k in range(3)]))
-    lines = (tmp_path / "f.csv").read_text().splitlines()
-    cells = lines[2].split(",")
-    cells[11:15] = ["0.0"] * 4
-    (tmp_path / "f.csv").write_text("\n".join([*lines[:2], ",".join(cells), lines[3]]) + "\n")
+    with_cells(tmp_path / "f.csv", 11, *["0.0"] * 4)
     read = frames.read_csv(tmp_path / "f.csv")
     assert read.finite.tolist() == [True, False, True] and len(read.trajectory()) == 2
 

@@ -50,19 +50,14 @@ class PayloadKilled(Step):
 
 
 @dataclass(frozen=True)
-class PayloadRestarted(Step):
+class PayloadRestarted(PayloadKilled):
     """It ends in order and starts as another session."""
-
-    STARTS: ClassVar[bool] = True
-
-    def lacking(self, world: World) -> str:
-        return "" if world.run.ended else "it flies on"
 
     def inject(self, world: World) -> None:
         world.hold_payload(self)
 
-    def fix(self, world: World) -> None:
-        world.let_payload(self)
+    def lacking(self, world: World) -> str:
+        return "" if world.run.ended else "it flies on"
 
 
 @dataclass(frozen=True)
