@@ -10,13 +10,15 @@ from collections.abc import Callable
 class Background:
     """Calls `act` every `period_s` until `end`; what it raises ends it and is kept in `failure`.
 
-    `acts` counts those that did not say False.
+    `acts` counts those that did not say False, nor raise `in_vain`, as when nobody is there.
     """
 
-    def __init__(self, act: Callable[[], object], period_s: float) -> None:
+    def __init__(
+        self, act: Callable[[], object], period_s: float, *in_vain: type[Exception]
+    ) -> None:
         self.failure: Exception | None = None
         self.acts = 0
-        self._act, self._period_s = act, period_s
+        self._act, self._period_s, self._in_vain = act, period_s, in_vain
         self._closing = threading.Event()
         self._cleanup = contextlib.ExitStack()
         self._thread = threading.Thread(target=self._run, name="hostile", daemon=True)
@@ -41,6 +43,7 @@ class Background:
     def _run(self) -> None:
         try:
             while not self._closing.wait(self._period_s):
-                self.acts += self._act() is not False
+                with contextlib.suppress(*self._in_vain):
+                    self.acts += self._act() is not False
         except Exception as error:
             self.failure = error

@@ -73,13 +73,9 @@ def _datagrams(world: World, next_one: Any, rate_hz: float) -> Background:
 
     def send() -> bool:
         datagram = next_one()
-        if datagram is not None:
-            with contextlib.suppress(ConnectionError):
-                out.sendto(datagram, to)
-                return True
-        return False
+        return datagram is not None and out.sendto(datagram, to) >= 0
 
-    return Background(send, 1.0 / rate_hz).at_end(out.close)
+    return Background(send, 1.0 / rate_hz, ConnectionError).at_end(out.close)
 
 
 @dataclass(frozen=True)
@@ -194,19 +190,14 @@ class Aborting(Peer):
             (port, data[: size % (len(data) + 1)]) for size in range(600) for port, data in whole
         )
 
-        def act() -> bool:
+        def abort() -> None:
             port, part = next(tries)
-            with (
-                contextlib.suppress(OSError),
-                socket.create_connection(("127.0.0.1", port), _TIMEOUT_S) as one,
-            ):
+            with socket.create_connection(("127.0.0.1", port), _TIMEOUT_S) as one:
                 one.sendall(part)
                 one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-                return True
-            return False
 
         world.kept[-id(self)] = self._open(world)
-        return Background(act, 1.0 / self.rate_hz)
+        return Background(abort, 1.0 / self.rate_hz, OSError)
 
     def fix(self, world: World) -> None:
         super().fix(world)
@@ -326,15 +317,12 @@ class BadTelemetry(Peer):
         draw = world.draw()
         session = world.client(world.certificates)
 
-        def act() -> bool:
+        def say() -> None:
             kind, text = _twisted(draw)
             who = draw.choice(("blimp-1", "blimp-1", "blimp-9", "NOT-A-NAME", "x" * 40))
-            with contextlib.suppress(Exception):  # the service may be down at this moment
-                session.zenoh.put(f"blimp/{who}/{kind}", text)
-                return True
-            return False
+            session.zenoh.put(f"blimp/{who}/{kind}", text)
 
-        return Background(act, 1.0 / self.rate_hz).at_end(session.close)
+        return Background(say, 1.0 / self.rate_hz, Exception).at_end(session.close)
 
 
 @dataclass(frozen=True)
@@ -354,15 +342,12 @@ class CommandFlood(Peer):
             b"[]",
         )
 
-        def act() -> bool:
+        def ask() -> None:
             name = draw.choice(("idr", "bitrate", "exposure", "bogus", "reboot"))
             key = f"blimp/blimp-1/command/{name}"
-            with contextlib.suppress(Exception):
-                session.zenoh.get(key, lambda _: None, payload=draw.choice(bodies), timeout=0.5)
-                return True
-            return False
+            session.zenoh.get(key, lambda _: None, payload=draw.choice(bodies), timeout=0.5)
 
-        return Background(act, 1.0 / self.rate_hz).at_end(session.close)
+        return Background(ask, 1.0 / self.rate_hz, Exception).at_end(session.close)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import json
 import time
@@ -94,11 +93,10 @@ class SecondStation(Step):
     @staticmethod
     def _commanding(session: Session, kbps: float) -> Background:
         def command() -> bool:
-            with contextlib.suppress(TelemetryError):  # the payload is just starting
-                return ask(session, NAME, "bitrate", {"kbps": kbps}, _LIMIT_S / 10).done
-            return False
+            return ask(session, NAME, "bitrate", {"kbps": kbps}, _LIMIT_S / 10).done
 
-        return Background(command, 1.0 / _SAYS_HZ)
+        # In vain while the payload is just starting.
+        return Background(command, 1.0 / _SAYS_HZ, TelemetryError)
 
     def lacking(self, world: World) -> str:
         commanding, _ = world.kept[id(self)]
