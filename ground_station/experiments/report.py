@@ -6,9 +6,11 @@ The table is made of one accepted run and stands between two markers.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
+
+from matplotlib.figure import Figure
 
 from ground_station.errors import InputError
 from ground_station.experiments import declaration, pictures, tables
@@ -20,6 +22,7 @@ from ground_station.presentation.pages import ThemedFigure, themed_figure, write
 from ground_station.presentation.readme import Block
 from ground_station.presentation.text import flat
 from ground_station.presentation.text import markdown as markdown_table
+from ground_station.presentation.theme import Theme
 
 _TEMPLATE = Path(__file__).parent / "templates" / "experiments.html"
 QUICK = (
@@ -95,42 +98,24 @@ def _pictures(experiment: dict[str, Any], atrium: FloorPlan | None) -> list[Them
     ]
     if not cases:
         return []
-    name = experiment["title"]
-    found = []
-    if experiment["level"]:
-        level = experiment["level"]
-        found.append(
-            themed_figure(
-                f"Error over {level}",
-                f"{name}: position error and share localized over {level}",
-                lambda theme: pictures.sweep(experiment["cases"], level, theme),
-            )
-        )
+    level, title = experiment["level"], experiment["title"]
     indoors = {case["flight"]["scene"] for case in cases if not case["flight"]["folder"]}
     plan = atrium if indoors == {"atrium"} else None
+    drawn: list[tuple[str, str, Callable[[Theme], Figure]]] = []
+    if level:
+        drawn.append((f"Error over {level}", f"position error and share localized over {level}",
+                      lambda theme: pictures.sweep(experiment["cases"], level, theme)))  # fmt: skip
     if any(pictures.first_series(case, "default") for case in cases):
-        found.append(
-            themed_figure(
-                "Paths, coloured by their error",
-                f"{name}: paths from above, by error",
-                lambda theme: pictures.paths(cases, plan, theme),
-            )
-        )
-    found.append(
-        themed_figure(
-            "Error over time: preset thesis dashed, each frame alone dotted",
-            f"{name}: position error over time",
-            lambda theme: pictures.over_time(cases, theme),
-        )
-    )
-    found.append(
-        themed_figure(
-            "Share of frames within an error: preset thesis dashed, each frame alone dotted",
-            f"{name}: distribution of the position error",
-            lambda theme: pictures.distribution(cases, theme),
-        )
-    )
-    return found
+        drawn.append(("Paths, coloured by their error", "paths from above, by error",
+                      lambda theme: pictures.paths(cases, plan, theme)))  # fmt: skip
+    styles = "preset thesis dashed, each frame alone dotted"
+    drawn += [
+        (f"Error over time: {styles}", "position error over time",
+         lambda theme: pictures.over_time(cases, theme)),
+        (f"Share of frames within an error: {styles}", "distribution of the position error",
+         lambda theme: pictures.distribution(cases, theme)),
+    ]  # fmt: skip
+    return [themed_figure(heading, f"{title}: {words}", draw) for heading, words, draw in drawn]
 
 
 def _setting(case: dict[str, Any]) -> tuple[str, str]:
