@@ -30,9 +30,9 @@ def capture_ns(index: int) -> int:
 
 def picture(index: int, *, dark: bool = False) -> NDArray[np.uint8]:
     """A moving picture (H, W), rich in grey levels unless dark, with its number in blocks."""
-    v, u = np.mgrid[0:HEIGHT_PX, 0:WIDTH_PX]
+    u, v = np.arange(WIDTH_PX), np.arange(HEIGHT_PX)[:, None]
     wave = np.sin((u + 3 * index) / 17.0) + np.cos((v - 2 * index) / 23.0) + u / WIDTH_PX
-    image = np.full(u.shape, 16.0) if dark else 128 + 36 * wave
+    image = np.full(wave.shape, 16.0) if dark else 128 + 36 * wave
     image = np.clip(image, 0, 255).astype(np.uint8)
     for bit in range(BITS):
         image[:BLOCK_PX, bit * BLOCK_PX : (bit + 1) * BLOCK_PX] = 220 if index >> bit & 1 else 20
