@@ -2,10 +2,8 @@
 
 import json
 import socket
-import subprocess
-import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -216,49 +214,3 @@ def test_over_tls_only_a_ground_on_the_list_is_answered(tmp_path: Path) -> None:
     assert len(fake.asked) == 1
     for session in (other, ground, served):
         session.close()
-
-
-@pytest.fixture
-def program(tmp_path: Path) -> Iterator[Callable[[str], None]]:
-    """Starts the payload's real program, connected to an endpoint, and ends it."""
-    running: list[subprocess.Popen[bytes]] = []
-
-    def start(endpoint: str) -> None:
-        settings = (
-            "camera.uri=test:", f'telemetry.connect=["{endpoint}"]', "link.port=9",
-            "recording.folder=", "wifi.interface=",
-        )  # fmt: skip
-        overrides = [part for setting in settings for part in ("--set", setting)]
-        with (tmp_path / "program.log").open("w") as log:
-            running.append(
-                subprocess.Popen(
-                    [sys.executable, "-m", "pi_firmware", *overrides], stdout=log, stderr=log
-                )
-            )
-
-    yield start
-    for process in running:
-        process.terminate()
-        try:
-            process.wait(LIMIT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
-def test_the_payloads_program_answers(
-    program: Callable[[str], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    endpoint = free_endpoint()
-    program(endpoint)
-
-    def command(*arguments: str) -> tuple[int, str]:
-        status = main(["command", "blimp-1", *arguments, "--listen", endpoint, "--timeout-s", "60"])
-        return status, capsys.readouterr().out.splitlines()[0]
-
-    assert command("idr") == (0, "blimp-1: idr: done")
-    assert command("bitrate", "kbps=777") == (0, "blimp-1: bitrate: done (kbps 777)")
-    status, said = command("bitrate", "kbps=1e9")
-    assert status == 1 and "'kbps' is 1e+09; allowed: 50 to 20000" in said
-    status, said = command("record-start")
-    assert status == 1 and "recording.folder" in said

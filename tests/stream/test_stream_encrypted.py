@@ -173,15 +173,6 @@ def test_the_payloads_key_is_read_or_refused_in_one_line(tmp_path: Path) -> None
     assert load_key(str(tmp_path)) == KEY
 
 
-def test_a_program_without_a_key_refuses_the_open_air(flight: Path) -> None:
-    process = start_payload(
-        f"camera.uri=replay:{flight}", "telemetry.enabled=false", "link.host=192.0.2.1"
-    )
-    _, err = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 2
-    assert err.count("\n") == 1 and "'192.0.2.1': no SRTP key" in err
-
-
 def test_a_program_with_a_key_file_that_was_cut_is_one_line(flight: Path, tmp_path: Path) -> None:
     folder = Authority.create(tmp_path / "keys").add("payload", "blimp-1")
     key = (folder / "srtp.key").read_text()
