@@ -10,7 +10,7 @@ import simulated_gauges as simulated
 from pi_firmware import battery
 from pi_firmware.battery.chip import Counts, GaugeError
 from pi_firmware.battery.gauges import cell_of
-from pi_firmware.settings import BatterySettings, EncoderSettings
+from pi_firmware.settings import BatterySettings
 from pi_firmware.wire import messages
 from pi_firmware.wire.messages import Battery
 
@@ -226,22 +226,3 @@ def test_a_link_that_fails_does_not_hold_up_the_end() -> None:
         time.sleep(0.05)
     assert len(silent.readings) == 1
     failing.stop()
-
-
-def test_a_low_battery_holds_the_encoder_down_whatever_the_link_bears() -> None:
-    from pi_firmware.encoder import Encoder
-
-    class Element:
-        """Where a GStreamer element would be."""
-
-        def set_property(self, name: str, value: int) -> None:
-            self.bitrate = value
-
-    element = Element()
-    encoder = Encoder(element, EncoderSettings(bitrate_kbps=2000, min_bitrate_kbps=200), 30.0)
-    encoder.set_bitrate(400)
-    assert encoder.limit_bitrate(600) == 400  # a bad link already asked for less
-    good = messages.LinkReport(1, "main", 5600, round_trip_s=0.01)
-    for _ in range(50):
-        encoder.link_report(good)  # and a good one asks for more
-    assert encoder.bitrate_kbps == element.bitrate == 600

@@ -108,3 +108,13 @@ def test_corrections_are_part_of_the_bit_rate() -> None:
     ):  # fmt: skip
         controlled.link_report(replace(report, retransmitted_kbps=again_kbps), corrections)
         assert controlled.bitrate_kbps == asked_kbps
+
+
+def test_a_low_battery_holds_it_down_whatever_the_link_bears() -> None:
+    element = Element()
+    controlled = Encoder(element, EncoderSettings(bitrate_kbps=2000, min_bitrate_kbps=200), 30.0)
+    controlled.set_bitrate(400)
+    assert controlled.limit_bitrate(600) == 400  # a bad link already asked for less
+    for _ in range(50):  # and a good one asks for more
+        controlled.link_report(LinkReport(1, "main", 5600, round_trip_s=0.01))
+    assert controlled.bitrate_kbps == element.kbps[-1] == 600

@@ -7,6 +7,7 @@ import threading
 import time
 from functools import partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from flying import ALL_FRAMES, Flying, numbers
@@ -15,6 +16,7 @@ from vehicle import Vehicle
 from ground_station.stream import command as commands
 from ground_station.stream.telemetry import PayloadState, TelemetryListener
 from pi_firmware import settings
+from pi_firmware.commands import actions
 from pi_firmware.payload import Payload
 from pi_firmware.recording import Recorder
 from pi_firmware.wire import messages
@@ -37,6 +39,7 @@ def test_the_bit_rate_stays_in_its_bounds_and_what_cannot_be_done_is_refused(
     flying: Flying,
 ) -> None:
     flown(flying, "encoder.min_bitrate_kbps=500", "supervision.period_s=0.2")
+    assert ask(flying, "idr").done
     assert ask(flying, "bitrate", kbps=800).values == {"kbps": 800}
     flying.state(lambda s: s.health is not None and s.health.bitrate_kbps == 800)
     assert ask(flying, "bitrate", kbps=100).values == {"kbps": 500}
@@ -106,24 +109,29 @@ def test_a_card_that_takes_no_recording_ends_no_flight(flying: Flying, tmp_path:
     flying.end()
 
 
-@pytest.mark.parametrize(
-    ("name", "key"),
-    [("shutdown", "battery.shutdown_command"), ("reboot", "supervision.reboot_command")],
-)
-def test_the_board_ends_by_command_after_all_else(
-    flying: Flying, tmp_path: Path, name: str, key: str
-) -> None:
+def test_a_reboot_and_a_shutdown_run_what_each_is_configured_to() -> None:
+    told: list[list[str]] = []
+    given = settings.load(
+        None, ['battery.shutdown_command=["off"]', 'supervision.reboot_command=["again"]']
+    )
+    made = actions(given, Mock(), Mock(), told.append, lambda: False)
+    for name in ("reboot", "shutdown"):
+        made[name].run()
+    assert told == [["again"], ["off"]]
+
+
+def test_the_board_ends_by_command_after_all_else(flying: Flying, tmp_path: Path) -> None:
     card, seen = tmp_path / "card", tmp_path / "seen"
     command = ["cp", "-r", str(card), str(seen)]
     flown(
         flying,
-        f"{key}={json.dumps(command)}",
+        f"supervision.reboot_command={json.dumps(command)}",
         f"recording.folder={card}",
         "recording.at_start=true",
         *RECORDING,
     )
     flying.state(lambda s: s.gate is not None and s.gate.sent > 40)
-    assert ask(flying, name).done
+    assert ask(flying, "reboot").done
     assert flying.process is not None
     flying.process.wait(LIMIT_S)
     flying.end()
@@ -168,7 +176,9 @@ def test_a_critical_battery_ends_recording_and_flight_and_then_the_board(
     command = ["sh", "-c", f"ls {card} > {mark}"]
     flying.start(
         "camera.uri=test:",
-        "battery.uri=fake:?percentage=0.02",
+        "battery.uri=fake:?percentage=0.3",
+        "battery.low_percentage=0.45",
+        "battery.critical_percentage=0.4",
         "battery.period_s=0.5",
         f"battery.shutdown_command={json.dumps(command)}",
         f"recording.folder={card}",

@@ -72,7 +72,7 @@ def test_a_camera_that_goes_and_comes_back_streams_again(flying: Flying) -> None
     assert flying.receiver.counters.packets_lost == 0
 
 
-def test_a_process_that_cannot_help_itself_ends_with_status_3_and_then_reboots_the_board(
+def test_a_process_that_cannot_help_itself_ends_and_the_next_reboots_the_board(
     flying: Flying, tmp_path: Path
 ) -> None:
     mark = tmp_path / "rebooted"
