@@ -6,7 +6,7 @@ import errno
 import functools
 import sys
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from pi_firmware.recording import Recorder
@@ -88,11 +88,12 @@ def recorder(
     events: Events | None = None,
     *,
     open_file: object = DurableFile,
+    force_idr: Callable[[], object] = lambda: None,
     **settings: object,
 ) -> Recorder:
     """A recorder that leaves the disk's free space alone unless told otherwise."""
-    values = {"folder": str(folder), "min_free_MB": 0, **settings}
-    return Recorder(RecordingSettings(**values), events or Events(), open_file=open_file)
+    limits = RecordingSettings(**{"folder": str(folder), "min_free_MB": 0, **settings})
+    return Recorder(limits, events or Events(), open_file=open_file, force_idr=force_idr)
 
 
 def video(*paths: Path) -> list[bytes]:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,10 +37,13 @@ def vehicle(tmp_path: Path) -> Iterator[Vehicle]:
 class Pilot:
     """The payload's side, with all the states it told."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(
+        self, vehicle: Vehicle, publish: Callable[..., None] | None = None, period_s: float = 0.1
+    ) -> None:
+        self.vehicle = vehicle
         self.told: list[messages.Autopilot] = []
-        settings = AutopilotSettings(uri=f"serial:{vehicle.link}?baud=921600", period_s=0.1)
-        self.autopilot = autopilot.open_autopilot(settings, self.told.append)
+        settings = AutopilotSettings(uri=f"serial:{vehicle.link}?baud=921600", period_s=period_s)
+        self.autopilot = autopilot.open_autopilot(settings, publish or self.told.append)
 
     def pose(self, x: float, age_ns: int = 0, **changes: Any) -> None:
         now_ns = time.time_ns()
@@ -54,6 +57,15 @@ class Pilot:
             messages.Pose(time_ns=now_ns, capture_ns=now_ns - age_ns, sequence=0, **values)
         )
 
+    def poses_until(self, condition: Callable[[], Any], **changes: Any) -> None:
+        """Gives one pose after the other until the condition holds."""
+
+        def give() -> None:
+            self.pose(1.0, **changes)
+            self.vehicle.listen()
+
+        eventually(condition, step=give)
+
 
 @pytest.fixture
 def pilot(vehicle: Vehicle) -> Iterator[Pilot]:
@@ -66,11 +78,7 @@ def pilot(vehicle: Vehicle) -> Iterator[Pilot]:
 def test_poses_arrive_in_ned_with_covariance_and_reset_counter(
     vehicle: Vehicle, pilot: Pilot
 ) -> None:
-    def give() -> None:
-        pilot.pose(1.0)
-        vehicle.listen()
-
-    eventually(lambda: vehicle.estimates(), step=give)
+    pilot.poses_until(vehicle.estimates)
     first = vehicle.estimates()[0]
     assert (first.x, first.y, first.z) == pytest.approx((1, -2, -3))
     assert (first.roll, first.pitch, first.yaw) == pytest.approx((0, 0, 0), abs=1e-6)
@@ -81,12 +89,7 @@ def test_poses_arrive_in_ned_with_covariance_and_reset_counter(
     assert abs(first.usec / 1e6 - time.time()) < LIMIT_S
     assert first.get_srcComponent() == 197
     assert vehicle.heard[0].get_type() == "HEARTBEAT"  # it says that it is there before all else
-
-    def give_relocalized() -> None:
-        pilot.pose(1.0, relocalized=True)
-        vehicle.listen()
-
-    eventually(lambda: vehicle.estimates()[-1].reset_counter >= 1, step=give_relocalized)
+    pilot.poses_until(lambda: vehicle.estimates()[-1].reset_counter >= 1, relocalized=True)
 
 
 def x25(data: bytes) -> int:
@@ -145,12 +148,7 @@ def test_stale_and_lost_poses_never_arrive(vehicle: Vehicle, pilot: Pilot) -> No
     eventually(
         lambda: pilot.told and pilot.told[-1].stale > 3 and pilot.told[-1].lost > 3, step=give
     )
-
-    def give_good() -> None:
-        pilot.pose(1.0)
-        vehicle.listen()
-
-    eventually(lambda: vehicle.estimates(), step=give_good)
+    pilot.poses_until(vehicle.estimates)
     assert {m.x for m in vehicle.estimates()} == {1.0}
 
 
@@ -197,18 +195,14 @@ def test_unknown_figures_and_other_senders_are_not_taken(vehicle: Vehicle, pilot
 def test_a_line_that_is_unplugged_is_opened_again_and_nothing_waits_for_it(
     vehicle: Vehicle, pilot: Pilot
 ) -> None:
-    def give() -> None:
-        pilot.pose(1.0)
-        vehicle.listen()
-
-    eventually(lambda: vehicle.estimates(), step=give)
+    pilot.poses_until(vehicle.estimates)
     vehicle.unplug()
     for _ in range(1000):
         pilot.pose(1.0)
     vehicle.plug()
     vehicle.heard.clear()
-    eventually(lambda: vehicle.estimates(), step=give)
-    eventually(lambda: pilot.told[-1].lines_opened >= 2, step=give)
+    pilot.poses_until(vehicle.estimates)
+    pilot.poses_until(lambda: pilot.told[-1].lines_opened >= 2)
 
 
 def test_a_line_that_nobody_reads_neither_blocks_poses_nor_the_end(
@@ -248,21 +242,10 @@ def test_a_telemetry_that_fails_does_not_stop_the_poses(vehicle: Vehicle) -> Non
     def broken(state: messages.Autopilot) -> None:
         raise RuntimeError("closed")
 
-    settings = AutopilotSettings(uri=f"serial:{vehicle.link}", period_s=60)
-    pilot = autopilot.open_autopilot(settings, broken)
-    pilot.start()
-
-    def give() -> None:
-        pilot.on_pose(
-            messages.Pose(
-                time_ns=1, capture_ns=time.time_ns(), sequence=0, state="TRACKING",
-                position_m=[1.0, 2.0, 3.0], quaternion_xyzw=LEVEL,
-            )
-        )  # fmt: skip
-        vehicle.listen()
-
-    eventually(lambda: len(vehicle.estimates()) > 3, step=give)
-    pilot.stop()
+    pilot = Pilot(vehicle, broken, period_s=60)
+    pilot.autopilot.start()
+    pilot.poses_until(lambda: len(vehicle.estimates()) > 3)
+    pilot.autopilot.stop()
 
 
 @pytest.mark.parametrize(

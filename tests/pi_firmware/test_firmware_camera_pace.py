@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from receiving import Receiver
-from tapped import start
+from tapped import run, words
 
 from ground_station.stream.assembly import ReceivedFrame
 from pi_firmware.sources.base import Window
@@ -60,13 +60,11 @@ def fly(settings: dict[str, object], options: str = "") -> list[ReceivedFrame]:
     with Receiver(0, queue_frames=1000) as receiver:
         uri = f"replay:{FLIGHT}?pace=stepped&duration_s=4{options}"
         given = {"link.port": receiver.port, "telemetry.enabled": False, "camera.uri": uri}
-        process = start(given | settings)
+        status, out, err = run(*words(given | settings))
+        assert status == 0, err
         frames = []
-        while (frame := receiver.get(0.5)) or process.poll() is None:
-            if frame:
-                frames.append(frame)
-        out, err = process.communicate(timeout=30)
-        assert process.returncode == 0, err
+        while frame := receiver.get(0.5):
+            frames.append(frame)
         assert f"{len(frames)} sent" in out
         assert receiver.counters.packets_lost == receiver.dropped == 0
     return frames

@@ -53,12 +53,15 @@ class Rig:
         self.link = "Not connected.\n"
         self.wifi = Wifi(
             WifiSettings(interface=wanted, restart_after_s=restart_after_s),
-            lambda name, text: self.events.append((name, text)),
+            lambda name, text: self.announce(name, text),
             root=root,
-            run=self.run,
+            run=lambda words: self.run(words),
             clock=lambda: self.now_s,
             off_s=0.0,
         )
+
+    def announce(self, name: str, text: str) -> None:
+        self.events.append((name, text))
 
     def run(self, words: list[str]) -> str:
         call = " ".join(words)
@@ -235,7 +238,7 @@ def test_a_ground_heard_within_a_restart_begins_the_pauses_anew(root: Path) -> N
             rig.wifi.heard()
         return obey(words)
 
-    rig.wifi._run = hears
+    rig.run = hears  # type: ignore[method-assign]
     rig.wifi.heard()
     assert rig.restarts(60) == [20, 40, 60]
 
@@ -365,19 +368,11 @@ def scripts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Programs:
 def test_the_programs_get_their_words_one_by_one(root: Path, scripts: Programs) -> None:
     scripts.write("iw", 'test "$3" = get && echo "Power save: off"; exit 0\n')
     scripts.write("ip")
-    events: list[str] = []
-    clock = [0.0]
-    wifi = Wifi(
-        WifiSettings("auto"),
-        lambda name, _: events.append(name),
-        root=root,
-        clock=lambda: clock[0],
-        off_s=0.0,
-    )
-    wifi.look()
-    wifi.heard()
-    clock[0] += 20
-    wifi.look()
+    rig = Rig(root)
+    rig.run = radio.run  # type: ignore[method-assign]
+    rig.look()
+    rig.wifi.heard()
+    rig.look(20.0)
     power_save = ["iw|dev|wlan0|set|power_save|off|", "iw|dev|wlan0|get|power_save|"]
     assert scripts.calls == [
         *power_save,
@@ -385,7 +380,7 @@ def test_the_programs_get_their_words_one_by_one(root: Path, scripts: Programs) 
         "ip|link|set|dev|wlan0|up|",
         *power_save,
     ]
-    assert events == [RESTARTED]
+    assert [name for name, _ in rig.events] == [RESTARTED]
 
 
 def test_a_program_that_refuses_is_one_line_with_its_reason(scripts: Programs) -> None:
@@ -440,7 +435,9 @@ def test_step_and_heard_never_wait_for_a_program_that_hangs(root: Path) -> None:
         release.wait(LIMIT_S)
         return "Power save: off\n"
 
-    wifi = Wifi(WifiSettings("auto"), lambda *_: None, root=root, run=hanging)
+    rig = Rig(root)
+    rig.run = hanging  # type: ignore[method-assign]
+    wifi = rig.wifi
     wifi.step()
     assert began.wait(LIMIT_S)
     for _ in range(100):
@@ -464,20 +461,13 @@ def test_stopped_in_the_middle_of_a_restart_the_radio_is_switched_on(root: Path)
             down.set()
         return "Power save: off\n"
 
-    now = [0.0]
-    wifi = Wifi(
-        WifiSettings("auto"),
-        lambda *_: None,
-        root=root,
-        run=run,
-        clock=lambda: now[0],
-        off_s=10 * LIMIT_S,
-    )
-    wifi.heard()
-    now[0] = 20.0
-    wifi.step()
+    rig = Rig(root)
+    rig.run, rig.wifi._off_s = run, 10 * LIMIT_S  # type: ignore[method-assign]
+    rig.wifi.heard()
+    rig.now_s += 20.0
+    rig.wifi.step()
     assert down.wait(LIMIT_S)
-    wifi.stop()
+    rig.wifi.stop()
     assert calls[calls.index("down") + 1] == "up"
     eventually(lambda: "wifi" not in {thread.name for thread in threading.enumerate()})
 
@@ -494,7 +484,9 @@ def test_an_announcement_that_fails_does_not_end_the_watch(root: Path) -> None:
             raise ValueError("not foreseen")
         return ""
 
-    wifi = Wifi(WifiSettings("auto"), announce, root=root, run=run)
+    rig = Rig(root)
+    rig.run, rig.announce = run, announce  # type: ignore[method-assign]
+    wifi = rig.wifi
     wifi.step()
     eventually(lambda: len(told) == 1)
     wifi.step()

@@ -26,6 +26,7 @@ from recorded import (
     unit,
     video,
 )
+from tapped import fly
 from waiting import eventually
 
 from ground_station.recording.open import open_input
@@ -94,8 +95,7 @@ def test_a_recording_holds_exactly_what_went_in(tmp_path: Path) -> None:
 
 def test_it_begins_with_an_idr_and_asks_for_one(tmp_path: Path) -> None:
     asked: list[int] = []
-    settings = RecordingSettings(folder=str(tmp_path), min_free_MB=0)
-    made = Recorder(settings, Events(), force_idr=lambda: asked.append(1))
+    made = recorder(tmp_path, force_idr=lambda: asked.append(1))
     made.start()
     units = feed(made, range(3, 25))
     path = tmp_path / made.stop()
@@ -140,8 +140,7 @@ def test_a_stream_without_idrs_is_asked_for_one_and_bounded(
 ) -> None:
     monkeypatch.setattr(run, "OVERRUN_BYTES", 500_000)
     asked: list[int] = []
-    settings = RecordingSettings(folder=str(tmp_path), min_free_MB=0, max_file_MB=1)
-    made = Recorder(settings, Events(), force_idr=lambda: asked.append(1))
+    made = recorder(tmp_path, force_idr=lambda: asked.append(1), max_file_MB=1)
     made.start()
     feed(made, [0], 20_000)
     for k in range(1, 201):  # one P frame after the other
@@ -231,8 +230,7 @@ def test_a_failing_link_or_encoder_ends_no_recording(tmp_path: Path) -> None:
     def fails(*_: str) -> None:
         raise RuntimeError("no link")
 
-    settings = RecordingSettings(folder=str(tmp_path), min_free_MB=0, max_file_MB=1)
-    made = Recorder(settings, fails, force_idr=fails)
+    made = recorder(tmp_path, fails, force_idr=fails, max_file_MB=1)
     made.start()
     units = feed(made, range(100), 15_000)
     made.stop()
@@ -288,14 +286,15 @@ def test_replay_and_ground_station_read_it(tmp_path: Path) -> None:
     assert [(f.time_ns, f.exposure_s) for f in frames] == [
         (info(k).time_ns, info(k).exposure_s) for k in range(40)
     ]
-    command = [sys.executable, "-m", "pi_firmware"]
-    for setting in (
-        f"camera.uri=replay:{path}", "camera.width_px=160", "camera.height_px=120",
-        "telemetry.enabled=false", "gate.enabled=false", "link.port=9",
-    ):  # fmt: skip
-        command += ["--set", setting]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0 and "40 captured" in done.stdout + done.stderr, done
+    flown = fly(
+        {
+            "camera.uri": f"replay:{path}?pace=stepped",
+            "camera.width_px": 160,
+            "camera.height_px": 120,
+            "gate.enabled": False,
+        }
+    )
+    assert flown.status == 0 and flown.sequences == list(range(40)), flown.err
 
 
 def test_a_payload_that_only_streams_loads_no_writer(tmp_path: Path) -> None:

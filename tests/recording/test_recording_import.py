@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numbered_flight import start_payload
 from numbered_video import HEIGHT, WIDTH, number_in
 from test_recording_video import write_video
 
@@ -72,15 +71,14 @@ def test_its_video_is_as_recordings_have_it(video: Path, camera: Path, tmp_path:
 def test_a_payload_plays_it(video: Path, camera: Path, tmp_path: Path) -> None:
     out = tmp_path / "walk.mcap"
     import_frames(open_input(video), load_camera(camera), out, name="walk")
-    words = ["camera.uri=replay:" + str(out), "camera.width_px=160", "camera.height_px=120"]
-    words += ["link.port=9", "telemetry.enabled=false", "gate.enabled=false"]
-    command = [sys.executable, "-m", "pi_firmware"]
-    for word in words:
-        command += ["--set", word]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 0, done.stderr
+    process = start_payload(
+        f"camera.uri=replay:{out}?pace=stepped", "camera.width_px=160", "camera.height_px=120",
+        "link.port=9", "telemetry.enabled=false", "gate.enabled=false",
+    )  # fmt: skip
+    told, complaint = process.communicate(timeout=60)
+    assert process.returncode == 0, complaint
     # A camera of 30 Hz takes one of the two that are 1 ms apart.
-    assert "9 captured" in done.stdout + done.stderr
+    assert "9 captured" in told
 
 
 def test_a_refusal_is_one_line_and_leaves_nothing(

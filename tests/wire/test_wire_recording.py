@@ -242,28 +242,29 @@ def test_a_wrong_length_in_a_whole_file_is_damage_and_no_cut(flight: Path) -> No
     assert reader.cut and "a length is wrong" in reader.cut_reason
 
 
-def bombs() -> dict[str, bytes]:
-    zeros = b"\0" * (64 << 20)
-    return {
-        "record of 2^60 bytes": record(Opcode.CHUNK, b"x" * 50, 1 << 60),
-        "record of 2^64 - 1 bytes": record(Opcode.MESSAGE, b"x" * 50, (1 << 64) - 1),
-        "metadata of 4 GB": record(Opcode.METADATA, struct.pack("<I", 0xFFFFFFFF) + b"x"),
-        "channel name of 4 GB": record(Opcode.CHANNEL, b"\1\0\0\0\xff\xff\xff\xff"),
-        "message in a chunk": chunk(record(Opcode.MESSAGE, b"x" * 30, 1 << 60)),
-        "schema in a chunk": chunk(record(Opcode.SCHEMA, b"\1\0\xff\xff\xff\xff", 1 << 40)),
-        "chunk claims 2^60": chunk(b"x" * 20, claimed=1 << 60),
-        "zstd bomb": chunk(zstandard.compress(zeros), compression="zstd", claimed=1000),
-        "lz4 bomb": chunk(lz4.frame.compress(zeros), compression="lz4", claimed=1000),
-        "zstd claims 1 GB": chunk(zstandard.compress(b"\0"), compression="zstd", claimed=1 << 30),
-        "unknown compression": chunk(b"x" * 20, compression="brotli"),
-        "message too short": record(Opcode.MESSAGE, b"x" * 5),
-    }
+ZEROS = 64 << 20
+BOMBS: dict[str, Callable[[], bytes]] = {
+    "record of 2^60 bytes": lambda: record(Opcode.CHUNK, b"x" * 50, 1 << 60),
+    "record of 2^64 - 1 bytes": lambda: record(Opcode.MESSAGE, b"x" * 50, (1 << 64) - 1),
+    "metadata of 4 GB": lambda: record(Opcode.METADATA, struct.pack("<I", 0xFFFFFFFF) + b"x"),
+    "channel name of 4 GB": lambda: record(Opcode.CHANNEL, b"\1\0\0\0\xff\xff\xff\xff"),
+    "message in a chunk": lambda: chunk(record(Opcode.MESSAGE, b"x" * 30, 1 << 60)),
+    "schema in a chunk": lambda: chunk(record(Opcode.SCHEMA, b"\1\0\xff\xff\xff\xff", 1 << 40)),
+    "chunk claims 2^60": lambda: chunk(b"x" * 20, claimed=1 << 60),
+    "zstd bomb": lambda: chunk(zstandard.compress(bytes(ZEROS)), compression="zstd", claimed=1000),
+    "lz4 bomb": lambda: chunk(lz4.frame.compress(bytes(ZEROS)), compression="lz4", claimed=1000),
+    "zstd claims 1 GB": lambda: chunk(
+        zstandard.compress(b"\0"), compression="zstd", claimed=1 << 30
+    ),
+    "unknown compression": lambda: chunk(b"x" * 20, compression="brotli"),
+    "message too short": lambda: record(Opcode.MESSAGE, b"x" * 5),
+}
 
 
-@pytest.mark.parametrize("name", list(bombs()))
-def test_hostile_sizes_ask_for_no_memory(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("bomb", BOMBS.values(), ids=BOMBS)
+def test_hostile_sizes_ask_for_no_memory(tmp_path: Path, bomb: Callable[[], bytes]) -> None:
     path = tmp_path / "bomb.mcap"
-    path.write_bytes(MAGIC + CHANNEL + MESSAGE + bombs()[name] + MESSAGE)
+    path.write_bytes(MAGIC + CHANNEL + MESSAGE + bomb() + MESSAGE)
     tracemalloc.start()
     try:
         reader = RecordingReader(path)
