@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
+from functools import cache
 
 import av
 import numpy as np
@@ -23,9 +24,16 @@ CABAC = "cabac=1"
 VARIETY = "cabac=1:partitions=all:ref=3:subme=6:8x8dct=1:weightp=2"
 
 
+@cache
 def units(slices: int = 1, more: str = CABAC) -> list[bytes]:
     made = encoded(FRAMES, slices=slices, more=more)
     return [stamped(unit, index) for index, unit in enumerate(made)]
+
+
+@cache
+def truth(slices: int = 1, more: str = CABAC) -> list[U8]:
+    """The pictures of these units."""
+    return pictures(units(slices, more))
 
 
 def pictures(sent: Sequence[bytes]) -> list[U8]:
@@ -65,11 +73,10 @@ def test_what_is_not_marked_is_what_was_sent(seed: int, slices: int, more: str) 
     datagrams = packets(sent, mtu_bytes=200)
     draw = random.Random(seed)
     lost = [number for number in range(20, len(datagrams) - 1) if draw.random() < 0.01]
-    truth = pictures(sent)
     frames, counters = received(datagrams, lost)
     assert counters.packets_lost == len(lost) > 0
     for frame in frames:
-        assert is_true(frame, truth[frame.sequence]), frame.sequence
+        assert is_true(frame, truth(slices, more)[frame.sequence]), frame.sequence
     damaged = [frame.damaged for frame in frames if frame.damaged is not None]
     assert len(damaged) == counters.damaged > 0
     assert len(frames) == counters.received
@@ -99,14 +106,14 @@ def test_a_cut_slice_damages_from_there_on_and_an_idr_heals_it() -> None:
 @pytest.mark.parametrize("more", [CABAC, VARIETY, "cabac=1:partitions=none:deblock=3"])
 @pytest.mark.parametrize("part", [0.6, 0.8])
 def test_motion_carries_damage_on_no_further_than_is_marked(part: float, more: str) -> None:
-    sent, truth = units(more=more), pictures(units(more=more))
+    sent = units(more=more)
     begin = len(packets(sent[:2], mtu_bytes=100))
     hit = len(packets(sent[:3], mtu_bytes=100)) - begin
     frames, _ = received(packets(sent, mtu_bytes=100), [begin + int(part * hit)])
     by_number = {frame.sequence: frame for frame in frames if frame.damaged is not None}
     assert set(by_number) >= {2, 3, 4}
     for number, frame in by_number.items():
-        assert is_true(frame, truth[number]), number
+        assert is_true(frame, truth(more=more)[number]), number
 
 
 def test_a_lost_sei_costs_nothing_once_the_clocks_are_known() -> None:
@@ -169,8 +176,7 @@ def test_parameter_sets_that_are_known_need_not_come_again(lost: tuple[int, ...]
     frames, counters = received(packets(sent), [hit[n] for n in lost])
     assert [frame.sequence for frame in frames] == list(range(FRAMES))
     assert counters.decoded == FRAMES and counters.idrs == 3
-    truth = pictures(sent)
-    assert all(is_true(frame, truth[frame.sequence]) for frame in frames)
+    assert all(is_true(frame, truth()[frame.sequence]) for frame in frames)
     # A recording may begin with it.
     assert len(pictures([frames[15].access_unit])) == 1
 
@@ -186,26 +192,24 @@ def test_other_parameter_sets_are_not_replaced_by_known_ones() -> None:
 def test_an_idr_that_is_cut_shows_what_of_it_came() -> None:
     sent = units()
     frames, _ = received(packets(sent), [in_frame(sent, 5)[1], in_frame(sent, 15)[-1]])
-    truth = pictures(sent)
     assert [frame.sequence for frame in frames] == [*range(5), *range(15, FRAMES)]
-    assert all(is_true(frame, truth[frame.sequence]) for frame in frames)
+    assert all(is_true(frame, truth()[frame.sequence]) for frame in frames)
     assert [frame.damaged is None for frame in frames] == [True] * 5 + [False] * 15 + [True] * 10
 
 
 def test_a_last_byte_that_says_nothing_of_the_picture_is_not_missed() -> None:
     """Of a slice's end, what closes arithmetic coding may stand alone in its last packet."""
     sent = units()
-    truth, idr = pictures(sent), sent[0]
-    sets = parameter_sets(idr)
+    sets = parameter_sets(sent[0])
     assert sets is not None
     free = []
     for number in range(1, 15):
-        missing = damage.missing_rows(sent[number][:-1], idr, sets)
+        missing = damage.missing_rows(sent[number][:-1], sent[0], sets)
         if missing is not None and not missing.any():
             free.append(number)
     assert free
     cut = [unit[:-1] if number in free else unit for number, unit in enumerate(sent)]
-    assert all(np.array_equal(a, b) for a, b in zip(pictures(cut), truth, strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(pictures(cut), truth(), strict=True))
 
 
 def test_a_stream_without_cabac_is_withheld() -> None:
