@@ -12,8 +12,4 @@ from flying import Flying
 def flying(tmp_path: Path) -> Iterator[Flying]:
     """Not started yet; whatever a test leaves running is ended."""
     with ExitStack() as stack:
-        made = Flying(stack, tmp_path)
-        yield made
-        if made.process is not None and made.process.poll() is None:
-            made.process.kill()
-            made.process.wait()
+        yield Flying(stack, tmp_path)

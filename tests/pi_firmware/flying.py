@@ -26,12 +26,14 @@ class Flying:
     """The program as a process, with somebody who receives and somebody who is systemd."""
 
     def __init__(self, stack: ExitStack, tmp_path: Path) -> None:
+        self.folder = tmp_path
         self.receiver = stack.enter_context(Receiver(port=0))
         self.listener = stack.enter_context(TelemetryListener(["tcp/127.0.0.1:0"]))
         self.notify = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
         self.notify.bind(str(tmp_path / "notify"))
         self.notify.setblocking(False)
         self.process: subprocess.Popen[str] | None = None
+        stack.callback(self.kill)
         self.environment = {
             **os.environ,
             "NOTIFY_SOCKET": str(tmp_path / "notify"),
@@ -68,6 +70,12 @@ class Flying:
                 lines.append(self.notify.recv(4096).decode())
             except BlockingIOError:
                 return lines
+
+    def kill(self) -> None:
+        """Ends what a test has left running."""
+        if self.process is not None and self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
 
     def end(self, status: int = 0) -> str:
         """Ends the program; the counters in its last line."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from unittest.mock import Mock
@@ -35,46 +37,51 @@ def flown(flying: Flying, *settings: str) -> None:
     flying.state(lambda s: s.gate is not None and s.gate.sent > 5)
 
 
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Flying]:
+    """One that takes orders, each frame of which is accounted for at its end."""
+    with ExitStack() as stack:
+        made = Flying(stack, tmp_path_factory.mktemp("flight"))
+        folder = f"recording.folder={made.folder / 'card'}"
+        flown(made, "encoder.min_bitrate_kbps=500", "supervision.period_s=0.2", folder, *RECORDING)
+        yield made
+        counted = numbers(made.end())
+        assert counted["captured"] == counted["sent"] + counted.get("disc", 0)
+
+
 def test_the_bit_rate_stays_in_its_bounds_and_what_cannot_be_done_is_refused(
-    flying: Flying,
+    flight: Flying,
 ) -> None:
-    flown(flying, "encoder.min_bitrate_kbps=500", "supervision.period_s=0.2")
-    assert ask(flying, "idr").done
-    assert ask(flying, "bitrate", kbps=800).values == {"kbps": 800}
-    flying.state(lambda s: s.health is not None and s.health.bitrate_kbps == 800)
-    assert ask(flying, "bitrate", kbps=100).values == {"kbps": 500}
-    assert ask(flying, "bitrate", kbps=9000).values == {"kbps": 2000}
-    refused = ask(flying, "bitrate", kbps=1e9)
+    assert ask(flight, "idr").done
+    assert ask(flight, "bitrate", kbps=800).values == {"kbps": 800}
+    flight.state(lambda s: s.health is not None and s.health.bitrate_kbps == 800)
+    assert ask(flight, "bitrate", kbps=100).values == {"kbps": 500}
+    assert ask(flight, "bitrate", kbps=9000).values == {"kbps": 2000}
+    refused = ask(flight, "bitrate", kbps=1e9)
     assert not refused.done and "allowed: 50 to 20000" in refused.reason
-    state = flying.has(messages.EVENT_COMMAND)
+    state = flight.has(messages.EVENT_COMMAND)
     assert any(e.text == "bitrate: done" for e in state.events)
     for name, reason in (
-        ("record-start", "recording.folder is empty: nothing can be recorded"),
-        ("record-stop", "nothing was recorded"),
         ("fly", "no command 'fly'"),
         ("shutdown", "'battery.shutdown_command' is empty"),
         ("reboot", "'supervision.reboot_command' is empty"),
     ):
-        refused = ask(flying, name)
+        refused = ask(flight, name)
         assert not refused.done and reason in refused.reason
-    flying.end()
 
 
-def test_exposure_is_set_anew_or_left_as_it_was(flying: Flying) -> None:
-    flown(flying)
-    assert ask(flying, "exposure", exposure_s=0.01, gain=2).values == {
+def test_exposure_is_set_anew_or_left_as_it_was(flight: Flying) -> None:
+    assert ask(flight, "exposure", exposure_s=0.01, gain=2).values == {
         "exposure_s": 0.01,
         "gain": 2.0,
     }
-    frame = until_exposed(flying, 0.01)
+    frame = until_exposed(flight, 0.01)
     assert frame == pytest.approx((0.01, 2.0))
-    refused = ask(flying, "exposure", exposure_s=0.5)
+    refused = ask(flight, "exposure", exposure_s=0.5)
     assert not refused.done and "camera.exposure_s is 0.5" in refused.reason
-    sent = flying.listener.state("blimp-1").gate.sent  # type: ignore[union-attr]
-    flying.state(lambda s: s.gate is not None and s.gate.sent > sent + 30)
-    assert until_exposed(flying, 0.01) == pytest.approx((0.01, 2.0))
-    counted = numbers(flying.end())
-    assert counted["captured"] == counted["sent"] + counted.get("disc", 0)
+    sent = flight.listener.state("blimp-1").gate.sent  # type: ignore[union-attr]
+    flight.state(lambda s: s.gate is not None and s.gate.sent > sent + 30)
+    assert until_exposed(flight, 0.01) == pytest.approx((0.01, 2.0))
 
 
 def until_exposed(flying: Flying, exposure_s: float) -> tuple[float | None, float | None]:
@@ -85,19 +92,18 @@ def until_exposed(flying: Flying, exposure_s: float) -> tuple[float | None, floa
     raise AssertionError("no frame with that exposure came")
 
 
-def test_a_recording_is_made_from_command_to_command(flying: Flying, tmp_path: Path) -> None:
-    flown(flying, f"recording.folder={tmp_path / 'card'}", *RECORDING)
-    assert ask(flying, "record-start").done
-    state = flying.has(messages.EVENT_RECORDING_STARTED)
+def test_a_recording_is_made_from_command_to_command(flight: Flying) -> None:
+    assert ask(flight, "record-stop").reason == "nothing was recorded"
+    assert ask(flight, "record-start").done
+    state = flight.has(messages.EVENT_RECORDING_STARTED)
     began = state.frames.sent if state.frames else 0
-    flying.state(lambda s: s.gate is not None and s.gate.sent > began + 60)
-    assert ask(flying, "record-stop").done
-    flying.has(messages.EVENT_RECORDING_ENDED)
-    (path,) = (tmp_path / "card").glob("*.mcap")
+    flight.state(lambda s: s.gate is not None and s.gate.sent > began + 60)
+    assert ask(flight, "record-stop").done
+    flight.has(messages.EVENT_RECORDING_ENDED)
+    (path,) = (flight.folder / "card").glob("*.mcap")
     reader = RecordingReader(path)
     assert len(list(reader.video())) >= 50 and not reader.cut
     assert "/blimp/gate" in reader.topics()
-    flying.end()
 
 
 def test_a_card_that_takes_no_recording_ends_no_flight(flying: Flying, tmp_path: Path) -> None:
