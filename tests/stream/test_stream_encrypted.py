@@ -173,18 +173,6 @@ def test_the_payloads_key_is_read_or_refused_in_one_line(tmp_path: Path) -> None
     assert load_key(str(tmp_path)) == KEY
 
 
-def test_a_program_with_a_key_file_that_was_cut_is_one_line(flight: Path, tmp_path: Path) -> None:
-    folder = Authority.create(tmp_path / "keys").add("payload", "blimp-1")
-    key = (folder / "srtp.key").read_text()
-    (folder / "srtp.key").write_text(key[:40])
-    process = start_payload(
-        f"camera.uri=replay:{flight}", f"telemetry.certificates={folder}", "telemetry.connect=[]"
-    )
-    _, err = process.communicate(timeout=LIMIT_S)
-    assert process.returncode == 2
-    assert err.count("\n") == 1 and "srtp.key: 20 bytes" in err and key[:40] not in err
-
-
 def test_a_flight_with_certificates_is_seen_by_its_ground_station_only(
     flight: Path, tmp_path: Path
 ) -> None:

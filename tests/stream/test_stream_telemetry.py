@@ -63,28 +63,18 @@ def test_payloads_are_told_apart(listener: TelemetryListener) -> None:
     two.close()
 
 
-def test_an_autopilots_state_is_kept(listener: TelemetryListener) -> None:
+def test_a_new_start_counts_from_zero(listener: TelemetryListener) -> None:
     telemetry = payload(listener)
-    sent = messages.Autopilot(time_ns=3, connected=True, armed=False, battery_V=3.9)
-    telemetry.publish(sent)
-    state = listener.wait("blimp-1", lambda s: s.autopilot is not None, LIMIT_S)
-    assert state is not None and state.autopilot == sent
-    telemetry.close()
-
-
-def test_health_is_kept_until_a_new_start(listener: TelemetryListener) -> None:
-    session = open_session(connect=listener.endpoints)
-    told = messages.Health(time_ns=4, uptime_s=2.5, sent=50, wifi_signal_dBm=-61.0, late=["camera"])
-    publisher = session.zenoh.declare_publisher(keys.key("blimp-1", keys.HEALTH))
-    publisher.put(messages.encode(told))
-    state = listener.wait("blimp-1", lambda s: s.health is not None, LIMIT_S)
-    assert state is not None and state.health == told
-    started = messages.Event(time_ns=9, name=messages.EVENT_STARTED, text="again")
-    session.zenoh.put(keys.key("blimp-1", keys.EVENT), messages.encode(started))
-    assert listener.wait("blimp-1", lambda s: s.events != [], LIMIT_S)
+    health = messages.Health(time_ns=4, uptime_s=2.5, wifi_signal_dBm=-61.0, late=["camera"])
+    telemetry.publish(health)
+    telemetry.publish(gate(5))
+    state = listener.wait("blimp-1", lambda s: s.gate is not None, LIMIT_S)
+    assert state is not None and state.health == health and [*state.decisions] == [5]
+    telemetry.publish(messages.Event(time_ns=9, name=messages.EVENT_STARTED, text="again"))
+    assert listener.wait_for_event("blimp-1", messages.EVENT_STARTED, LIMIT_S)
     state = listener.state("blimp-1")
-    assert state is not None and state.health is None
-    session.close()
+    assert state is not None and state.decisions == {} and state.frames is state.health is None
+    telemetry.close()
 
 
 def test_discarded_frames_are_counted_and_none_of_an_older_payload() -> None:
@@ -105,16 +95,6 @@ def test_decisions_are_kept_by_frame_and_the_newest_counts(listener: TelemetryLi
     assert state is not None
     assert state.frames == FrameCounts(captured=50, gated=4, heartbeats=0, sent=49)
     assert state.ssrc == 9
-    telemetry.close()
-
-
-def test_a_new_start_counts_from_zero(listener: TelemetryListener) -> None:
-    telemetry = payload(listener)
-    telemetry.publish(gate(5))
-    telemetry.publish(messages.Event(time_ns=9, name=messages.EVENT_STARTED, text="again"))
-    assert listener.wait_for_event("blimp-1", messages.EVENT_STARTED, LIMIT_S)
-    state = listener.state("blimp-1")
-    assert state is not None and state.decisions == {} and state.frames is None
     telemetry.close()
 
 
