@@ -1,14 +1,16 @@
 """What the payload says and does about its battery: alarms, silence, an orderly end."""
 
 import threading
-import time
 from typing import Any
 
 import pytest
 import simulated_gauges as simulated
+from waiting import eventually
 
 from pi_firmware import battery
-from pi_firmware.battery.chip import Counts, GaugeError
+from pi_firmware.battery.cell import Cell
+from pi_firmware.battery.chip import Counts, GaugeError, WordBus
+from pi_firmware.battery.chips import ina
 from pi_firmware.battery.gauges import cell_of
 from pi_firmware.settings import BatterySettings
 from pi_firmware.wire import messages
@@ -83,10 +85,6 @@ def test_a_sag_of_a_moment_is_no_alarm_and_a_lasting_one_ends_the_flight_above_3
 
 
 def test_shutdown_comes_before_3_2_volts_under_load() -> None:
-    from pi_firmware.battery.cell import Cell
-    from pi_firmware.battery.chip import WordBus
-    from pi_firmware.battery.chips import ina
-
     for celsius in (5.0, 25.0):
         cell = simulated.SimulatedCell(Cell(0.55, temperature_c=celsius - 3), 0.3)
         chip, counts, shunt = simulated.Ina226Chip(), Counts(), ina.Shunt(0.1, 0.8)
@@ -221,8 +219,5 @@ def test_a_link_that_fails_does_not_hold_up_the_end() -> None:
         announce=broken,
     )
     failing.start()
-    end_s = time.monotonic() + 20
-    while len(silent.readings) > 1 and time.monotonic() < end_s:
-        time.sleep(0.05)
-    assert len(silent.readings) == 1
+    eventually(lambda: len(silent.readings) == 1)
     failing.stop()

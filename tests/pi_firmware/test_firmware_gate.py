@@ -71,16 +71,16 @@ def passes(verdicts: list[Verdict]) -> list[bool]:
 
 
 def test_gate_reopens_only_above_the_hysteresis() -> None:
-    gate = Gate(GateSettings(min_entropy_bits=5.0, hysteresis_bits=0.2, heartbeat_s=0.0))
-    entropies = [5.0, 4.99, 5.1, 5.19, 5.2, 5.05, 4.9]
+    gate = Gate(GateSettings(min_entropy_bits=6.0, hysteresis_bits=0.5, heartbeat_s=0.0))
+    entropies = [6.0, 5.99, 6.2, 6.49, 6.5, 6.1, 5.9]
     verdicts = decisions(gate, [rich(e) for e in entropies])
     assert passes(verdicts) == [True, False, False, False, True, True, False]
     assert {v.reason for v in verdicts if not v.passed} == {Reason.ENTROPY}
 
 
 def test_a_frame_far_blurrier_than_those_before_is_gated_until_it_is_sharp_again() -> None:
-    gate = Gate(GateSettings(min_sharpness_ratio=0.3, heartbeat_s=0.0))
-    sharpness = [100.0] * 20 + [31.0, 29.0, 35.0, 37.0, 100.0]
+    gate = Gate(GateSettings(min_sharpness_ratio=0.5, heartbeat_s=0.0))
+    sharpness = [100.0] * 20 + [51.0, 49.0, 59.0, 61.0, 100.0]
     verdicts = decisions(gate, [rich(sharpness=s) for s in sharpness])
     assert passes(verdicts) == [True] * 21 + [False, False, True, True]
     assert verdicts[21].reason is verdicts[22].reason is Reason.BLUR
@@ -99,11 +99,11 @@ def test_nothing_is_called_blurred_before_there_is_something_to_compare_with() -
 
 
 def test_a_frame_like_the_last_one_sent_is_gated_but_slow_drift_is_not() -> None:
-    gate = Gate(GateSettings(min_difference=0.5, heartbeat_s=0.0))
-    verdicts = decisions(gate, [rich(level=100 + 0.2 * index) for index in range(10)])
+    gate = Gate(GateSettings(min_difference=1.0, heartbeat_s=0.0))
+    verdicts = decisions(gate, [rich(level=100 + 0.4 * index) for index in range(10)])
     assert passes(verdicts) == [index % 3 == 0 for index in range(10)]
     assert verdicts[0].difference is None
-    assert verdicts[3].difference == pytest.approx(0.6, abs=1e-4)
+    assert verdicts[3].difference == pytest.approx(1.2, abs=1e-4)
     assert verdicts[1].reason is Reason.DUPLICATE
 
 

@@ -52,17 +52,11 @@ SEEN_BY: dict[str, tuple[str, ...]] = {
         "telemetry.listen",
     ),
     # Short flights, by the video that leaves them or by how they end.
-    "keys_flight::test_a_gate_that_is_off_sends_what_it_would_have_dropped": ("gate.enabled",),
-    "keys_flight::test_each_of_the_gates_tests_can_be_left_out": (
-        "gate.min_entropy_bits",
-        "gate.min_sharpness_ratio",
-        "gate.min_difference",
-    ),
-    "keys_flight::test_the_entropys_threshold_and_hysteresis_decide": ("gate.hysteresis_bits",),
-    "keys_flight::test_heartbeats_come_as_often_as_configured": ("gate.heartbeat_s",),
     "keys_flight::test_an_idr_follows_a_gap_of_the_configured_length": ("gate.idr_after_s",),
-    "keys_flight::test_an_idr_comes_each_so_many_frames": ("encoder.gop_frames",),
-    "keys_flight::test_the_encoder_makes_so_many_bits": ("encoder.bitrate_kbps",),
+    "keys_flight::test_an_idr_comes_each_so_many_frames_of_so_many_bits": (
+        "encoder.gop_frames",
+        "encoder.bitrate_kbps",
+    ),
     "keys_flight::test_telemetry_that_is_off_listens_nowhere": ("telemetry.enabled",),
     "keys_flight::test_with_certificates_it_speaks_tls_and_sends_plain_video_if_told_to": (
         "link.encrypted",
@@ -83,6 +77,18 @@ SEEN_BY: dict[str, tuple[str, ...]] = {
         "supervision.reboot_command",
     ),
     # The objects that they configure.
+    "gate::test_disabled_gate_passes_everything": ("gate.enabled",),
+    "gate::test_gate_reopens_only_above_the_hysteresis": (
+        "gate.min_entropy_bits",
+        "gate.hysteresis_bits",
+    ),
+    "gate::test_a_frame_far_blurrier_than_those_before_is_gated_until_it_is_sharp_again": (
+        "gate.min_sharpness_ratio",
+    ),
+    "gate::test_a_frame_like_the_last_one_sent_is_gated_but_slow_drift_is_not": (
+        "gate.min_difference",
+    ),
+    "gate::test_heartbeat_counts_from_the_last_frame_sent": ("gate.heartbeat_s",),
     "keys_rooms::test_a_key_is_seen_where_it_is_used": (
         "encoder.max_queue_s",
         "encoder.max_round_trip_s",

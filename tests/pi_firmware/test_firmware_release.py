@@ -1,11 +1,11 @@
 """The payload says which version it is and how it came to run, to telemetry and to systemd."""
 
 import json
-import time
 from typing import Any
 
 import pytest
-from flying import LIMIT_S, Flying
+from flying import Flying
+from waiting import eventually
 
 from deploy.board.releases import service
 from ground_station.stream.feedback import Feedback
@@ -58,10 +58,7 @@ def test_the_program_tells_its_release_and_why_an_update_did_not_stay(
     before = f"STATUS=version {UPDATE} (fell back): 0.2.0+gitbad: no frames within 120 s; telemetry"
     lines = flying.said()
     with Feedback(flying.listener, lambda payload_id: flying.receiver):
-        until_s = time.monotonic() + LIMIT_S
-        while f"{before} up" not in lines and time.monotonic() < until_s:
-            time.sleep(0.1)
-            lines += flying.said()
+        eventually(lambda: f"{before} up" in lines, step=lambda: lines.extend(flying.said()))
     # What tries out a release on the card reads this very line.
     assert supervision.TELEMETRY_UP == service.TELEMETRY_UP
     assert supervision.ARMED == service.ARMED
