@@ -42,22 +42,27 @@ class Flight:
 
     frames: list[ReceivedFrame]
     state: PayloadState
-    end: messages.Event | None
+    end: messages.Event
     status: int
     out: str
     err: str
+    receiver: Receiver
+    link: ImpairedLink
 
 
 def fly(
-    receiver: Receiver,
     *settings: str,
-    port: int | None = None,
+    loss: float = 0.0,
     on_frame: Callable[[subprocess.Popen[str], int], None] = lambda process, count: None,
 ) -> Flight:
     """Runs the payload to its end, taking all frames, and listens to its telemetry."""
-    with TelemetryListener(["tcp/127.0.0.1:0"]) as listener:
+    with (
+        Receiver(0, queue_frames=100) as receiver,
+        ImpairedLink(receiver.port, Impairment(loss=loss), seed=2) as link,
+        TelemetryListener(["tcp/127.0.0.1:0"]) as listener,
+    ):
         process = start_payload(
-            f"link.port={port or receiver.port}",
+            f"link.port={link.port if loss else receiver.port}",
             f"telemetry.connect={json.dumps(listener.endpoints)}",
             *settings,
         )
@@ -76,7 +81,7 @@ def fly(
         )
         assert state is not None, err
         end = next(event for event in state.events if event.name in ends)
-        return Flight(frames, state, end, process.returncode, out, err)
+        return Flight(frames, state, end, process.returncode, out, err, receiver, link)
 
 
 def assert_true(frames: list[ReceivedFrame]) -> None:
@@ -87,20 +92,19 @@ def assert_true(frames: list[ReceivedFrame]) -> None:
 
 
 def test_all_frames_of_a_flight_arrive_with_their_exact_capture_times(flight: Path) -> None:
-    with Receiver(0, queue_frames=100) as receiver:
-        flown = fly(receiver, f"camera.uri=replay:{flight}")
-        assert flown.status == 0, flown.err
-        assert_true(flown.frames)
-        assert [frame.sequence for frame in flown.frames] == list(range(60))
-        assert [number_in(frame.image) for frame in flown.frames] == list(range(60))
-        for index, frame in enumerate(flown.frames):
-            assert frame.exposure_s == pytest.approx(0.01 + index / 2**16, rel=1e-6)
-            assert frame.gain == 2.0
-            assert frame.clock_ns <= frame.arrival_ns
-        assert flown.state.ssrc == receiver.ssrc
-        counters = receiver.counters
-        assert counters.packets_lost == counters.withheld == counters.garbage == 0
-    assert flown.end is not None and flown.end.name == messages.EVENT_END_OF_STREAM
+    flown = fly(f"camera.uri=replay:{flight}")
+    assert flown.status == 0, flown.err
+    assert_true(flown.frames)
+    assert [frame.sequence for frame in flown.frames] == list(range(60))
+    assert [number_in(frame.image) for frame in flown.frames] == list(range(60))
+    for index, frame in enumerate(flown.frames):
+        assert frame.exposure_s == pytest.approx(0.01 + index / 2**16, rel=1e-6)
+        assert frame.gain == 2.0
+        assert frame.clock_ns <= frame.arrival_ns
+    assert flown.state.ssrc == flown.receiver.ssrc
+    counters = flown.receiver.counters
+    assert counters.packets_lost == counters.withheld == counters.garbage == 0
+    assert flown.end.name == messages.EVENT_END_OF_STREAM
     assert flown.end.values["captured"] == flown.end.values["sent"] == 60
     assert "60 captured, 0 gated, 60 sent" in flown.out
     assert flown.state.battery is not None and flown.state.battery.power_supply_status == 2
@@ -117,8 +121,7 @@ def test_all_frames_of_a_flight_arrive_with_their_exact_capture_times(flight: Pa
 def test_dark_frames_are_gated_and_counted_but_a_heartbeat_comes(tmp_path: Path) -> None:
     dark = set(range(15, 45))
     recording = write_flight(tmp_path / "dark.mcap", 60, dark)
-    with Receiver(0, queue_frames=100) as receiver:
-        flown = fly(receiver, f"camera.uri=replay:{recording}?speed=2", "gate.heartbeat_s=0.2")
+    flown = fly(f"camera.uri=replay:{recording}?speed=2", "gate.heartbeat_s=0.2")
     assert flown.status == 0, flown.err
     assert_true(flown.frames)
     counts = flown.state.frames
@@ -135,18 +138,9 @@ def test_dark_frames_are_gated_and_counted_but_a_heartbeat_comes(tmp_path: Path)
 
 
 def test_at_five_percent_loss_every_frame_is_right_and_accounted_for(flight: Path) -> None:
-    with (
-        Receiver(0, queue_frames=100) as receiver,
-        ImpairedLink(receiver.port, Impairment(loss=0.05), seed=2) as link,
-    ):
-        flown = fly(
-            receiver,
-            f"camera.uri=replay:{flight}",
-            "encoder.gop_frames=3",
-            "encoder.bitrate_kbps=400",
-            port=link.port,
-        )
-        counters = receiver.counters
+    settings = ("encoder.gop_frames=3", "encoder.bitrate_kbps=400")
+    flown = fly(f"camera.uri=replay:{flight}", *settings, loss=0.05)
+    counters, link = flown.receiver.counters, flown.link
     assert flown.status == 0, flown.err
     assert link.counts.lost > 0
     late_ns = [abs(frame.time_ns - capture_ns(frame.sequence)) for frame in flown.frames]
@@ -216,9 +210,8 @@ def test_what_is_on_the_wire_is_as_agreed(tmp_path: Path) -> None:
 
 
 def test_a_slower_camera_takes_its_frames_of_a_stretch_and_speed_shortens_it(flight: Path) -> None:
-    with Receiver(0, queue_frames=100) as receiver:
-        uri = f"camera.uri=replay:{flight}?rate_hz=10&start_s=0.5&duration_s=1&speed=4"
-        flown = fly(receiver, uri)
+    uri = f"camera.uri=replay:{flight}?rate_hz=10&start_s=0.5&duration_s=1&speed=4"
+    flown = fly(uri)
     assert_true(flown.frames)
     first = capture_ns(0) + 500_000_000
     stretch = [i for i in range(60) if first <= capture_ns(i) < first + 1_000_000_000]
@@ -233,9 +226,8 @@ def test_a_loop_goes_on_with_rising_times_until_it_is_stopped(flight: Path) -> N
         if count == 40:
             process.send_signal(signal.SIGTERM)
 
-    with Receiver(0, queue_frames=100) as receiver:
-        uri = f"camera.uri=replay:{flight}?duration_s=0.5&loop=1&speed=2"
-        flown = fly(receiver, uri, on_frame=stop)
+    uri = f"camera.uri=replay:{flight}?duration_s=0.5&loop=1&speed=2"
+    flown = fly(uri, on_frame=stop)
     assert flown.status == 0, flown.err
     times = [frame.time_ns for frame in flown.frames]
     assert times == sorted(set(times))
@@ -249,10 +241,9 @@ def test_a_ctrl_c_ends_the_flight_in_order(flight: Path) -> None:
         if count == 10:
             process.send_signal(signal.SIGINT)
 
-    with Receiver(0, queue_frames=100) as receiver:
-        flown = fly(receiver, f"camera.uri=replay:{flight}?loop=1", on_frame=stop)
+    flown = fly(f"camera.uri=replay:{flight}?loop=1", on_frame=stop)
     assert (flown.status, flown.err) == (0, "")
-    assert flown.end is not None and flown.end.name == messages.EVENT_STOPPED
+    assert flown.end.name == messages.EVENT_STOPPED
     # What was captured before the signal was still sent.
     assert flown.end.values["captured"] == flown.end.values["sent"] == len(flown.frames)
 
@@ -260,8 +251,7 @@ def test_a_ctrl_c_ends_the_flight_in_order(flight: Path) -> None:
 def test_a_cut_recording_is_flown_up_to_the_cut_and_says_so(flight: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(flight.read_bytes()[: int(0.6 * flight.stat().st_size)])
-    with Receiver(0, queue_frames=100) as receiver:
-        flown = fly(receiver, f"camera.uri=replay:{cut}?pace=stepped")
+    flown = fly(f"camera.uri=replay:{cut}?pace=stepped")
     assert flown.status == 0, flown.err
     assert 10 < len(flown.frames) < 60
     assert_true(flown.frames)
