@@ -1,7 +1,6 @@
 """The battery: gauges chosen by URI, state of charge, and what happens when it runs low."""
 
-from pi_firmware.battery.chip import Gauge
 from pi_firmware.battery.gauges import open_gauge
 from pi_firmware.battery.monitor import Monitor
 
-__all__ = ["Gauge", "Monitor", "open_gauge"]
+__all__ = ["Monitor", "open_gauge"]

@@ -129,8 +129,21 @@ def signed(word: int) -> int:
     return word - 0x10000 if word & 0x8000 else word
 
 
-CHARGING, DISCHARGING, GOOD, LIPO = 1, 2, 1, 3
-"""Of a battery's `power_supply_status`, `_health` and `_technology`."""
+CHARGING = 1
+"""Of a battery's `power_supply_status`."""
+_DISCHARGING, _GOOD, _LIPO = 2, 1, 3
+
+
+def reading(time_ns: int, voltage: float, *, charging: bool, **more: float | None) -> Battery:
+    """What a gauge reads of a lithium-polymer cell; `more` are other fields of the message."""
+    return Battery(
+        time_ns=time_ns,
+        voltage=voltage,
+        power_supply_status=CHARGING if charging else _DISCHARGING,
+        power_supply_health=_GOOD,
+        power_supply_technology=_LIPO,
+        **more,  # type: ignore[arg-type]  # those of numbers that may be unmeasured
+    )
 
 
 class Gauge(Protocol):

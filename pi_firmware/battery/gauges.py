@@ -11,17 +11,7 @@ from collections.abc import Callable
 from pi_firmware import uri
 from pi_firmware.battery import chips
 from pi_firmware.battery.cell import Cell
-from pi_firmware.battery.chip import (
-    DISCHARGING,
-    GOOD,
-    LIPO,
-    Chip,
-    Counts,
-    Gauge,
-    Shunt,
-    Smbus,
-    WordBus,
-)
+from pi_firmware.battery.chip import Chip, Counts, Gauge, Shunt, Smbus, WordBus, reading
 from pi_firmware.settings import BatterySettings
 from pi_firmware.uri import Uri
 from pi_firmware.wire.messages import Battery
@@ -55,17 +45,15 @@ class FakeGauge:
         at = min(bisect(_CHARGE, left), len(_CHARGE) - 1)
         beyond = (left - _CHARGE[at - 1]) / (_CHARGE[at] - _CHARGE[at - 1])
         rest_v = _VOLTAGE_V[at - 1] + beyond * (_VOLTAGE_V[at] - _VOLTAGE_V[at - 1])
-        return Battery(
-            time_ns=time_ns,
-            voltage=round(rest_v + current_a * _RESISTANCE_OHM, 4),
+        return reading(
+            time_ns,
+            round(rest_v + current_a * _RESISTANCE_OHM, 4),
+            charging=False,
             percentage=left,
             current=current_a,
             charge=left * self._capacity_ah,
             capacity=self._capacity_ah,
             design_capacity=self._capacity_ah,
-            power_supply_status=DISCHARGING,
-            power_supply_health=GOOD,
-            power_supply_technology=LIPO,
             time_left_s=left * self._full_s,
         )
 

@@ -8,9 +8,9 @@ import pkgutil
 from pi_firmware import uri
 from pi_firmware.settings import CameraSettings
 from pi_firmware.sources import schemes
-from pi_firmware.sources.base import Source, Stamp
+from pi_firmware.sources.base import Source
 
-__all__ = ["Source", "Stamp", "check", "open_source"]
+__all__ = ["Source", "check", "open_source"]
 
 WHAT = "camera.uri"
 

@@ -7,18 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
-from pi_firmware.battery.chip import (
-    CHARGING,
-    DISCHARGING,
-    GOOD,
-    LIPO,
-    Chip,
-    Counts,
-    GaugeError,
-    Shunt,
-    WordBus,
-    signed,
-)
+from pi_firmware.battery.chip import Chip, Counts, GaugeError, Shunt, WordBus, reading, signed
 from pi_firmware.uri import Uri
 from pi_firmware.wire.messages import Battery
 
@@ -67,6 +56,11 @@ class _Ina(ABC):
             raise self.counts.refuse("the gauge has lost its settings; it is set up again")
         return drop, bus, current
 
+    def _reading(self, time_ns: int, voltage: float, through_shunt_a: float) -> Battery:
+        outwards = self._shunt.discharge_positive
+        current = -through_shunt_a if outwards else through_shunt_a
+        return reading(time_ns, voltage, charging=current > 0, current=current)
+
 
 class Ina219(_Ina):
     """Voltage of the cell and its current, averaged over 128 samples (68 ms).
@@ -98,7 +92,7 @@ class Ina219(_Ina):
         voltage = ina219_bus_voltage(bus)
         if self._shunt.discharge_positive:
             voltage += drop * 10e-6
-        return _reading(time_ns, voltage, current * self._lsb_a, self._shunt)
+        return self._reading(time_ns, voltage, current * self._lsb_a)
 
     def _reset(self) -> None:
         self._bus.write(CONFIGURATION, RESET)
@@ -131,7 +125,7 @@ class Ina226(_Ina):
         if drop in (-0x8000, 0x7FFF):
             raise self.counts.refuse("ina226: the shunt's voltage is beyond the range")
         _check_agreement(self.counts, current, drop * self._calibration / 2048)
-        return _reading(time_ns, ina226_bus_voltage(bus), current * self._lsb_a, self._shunt)
+        return self._reading(time_ns, ina226_bus_voltage(bus), current * self._lsb_a)
 
     def _reset(self) -> None:
         found = self._bus.read(MANUFACTURER_ID), self._bus.read(DIE_ID)
@@ -180,18 +174,6 @@ def _check_agreement(counts: Counts, current: int, expected: float) -> None:
     """
     if abs(current - expected) > max(0.1 * abs(expected), 64):
         raise counts.refuse("the current contradicts the shunt's voltage")
-
-
-def _reading(time_ns: int, voltage: float, through_shunt_a: float, shunt: Shunt) -> Battery:
-    current = -through_shunt_a if shunt.discharge_positive else through_shunt_a
-    return Battery(
-        time_ns=time_ns,
-        voltage=voltage,
-        current=current,
-        power_supply_status=CHARGING if current > 0 else DISCHARGING,
-        power_supply_health=GOOD,
-        power_supply_technology=LIPO,
-    )
 
 
 def _shunt(parsed: Uri, max_A: float) -> Shunt:

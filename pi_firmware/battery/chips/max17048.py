@@ -5,17 +5,7 @@ Registers and units are those of Maxim's datasheet 19-6171, revision 7.
 
 from __future__ import annotations
 
-from pi_firmware.battery.chip import (
-    CHARGING,
-    DISCHARGING,
-    GOOD,
-    LIPO,
-    Chip,
-    Counts,
-    GaugeError,
-    WordBus,
-    signed,
-)
+from pi_firmware.battery.chip import Chip, Counts, GaugeError, WordBus, reading, signed
 from pi_firmware.wire.messages import Battery
 
 VCELL, SOC, VERSION, CONFIG, CRATE, STATUS = 0x02, 0x04, 0x08, 0x0C, 0x16, 0x1A
@@ -49,15 +39,13 @@ class Max17048:
         if share > _HIGHEST_SHARE:
             raise self.counts.refuse(f"max17048: {100 * share:.0f} % is no state of charge")
         share = min(share, 1.0)
-        return Battery(
-            time_ns=time_ns,
-            voltage=voltage,
+        return reading(
+            time_ns,
+            voltage,
+            charging=rate_per_h > _MIN_RATE_PER_H,
             percentage=share,
             charge=share * self._capacity_ah,
             time_left_s=3600 * share / -rate_per_h if rate_per_h <= -_MIN_RATE_PER_H else None,
-            power_supply_status=CHARGING if rate_per_h > _MIN_RATE_PER_H else DISCHARGING,
-            power_supply_health=GOOD,
-            power_supply_technology=LIPO,
         )
 
     def close(self) -> None:
