@@ -128,16 +128,13 @@ def test_a_driver_loaded_anew_is_kept_awake_at_once(root: Path) -> None:
     assert rig.look() == ["iw dev wlan0 set power_save off", "iw dev wlan0 get power_save"]
 
 
-@pytest.mark.parametrize("reason", ["iw is not installed", "Operation not permitted"])
-def test_an_iw_that_is_missing_or_refuses_is_told_once_and_tried_again(
-    root: Path, reason: str
-) -> None:
+def test_an_iw_that_refuses_is_told_once_and_tried_again(root: Path) -> None:
     rig = Rig(root)
-    rig.refusing["iw"] = reason
+    rig.refusing["iw"] = "Operation not permitted"
     for _ in range(200):
         rig.look()
     assert [name for name, _ in rig.events] == [messages.EVENT_RADIO_FAILED]
-    assert reason in rig.events[0][1]
+    assert "Operation not permitted" in rig.events[0][1]
     del rig.refusing["iw"]
     for _ in range(61):
         rig.look()
@@ -161,18 +158,6 @@ def test_a_silent_ground_restarts_the_radio_ever_more_seldom(root: Path) -> None
     assert "silent for 20 s" in rig.events[0][1]
     rig.wifi.heard()
     assert rig.restarts(70) == [20, 60], "heard again: it begins again"
-
-
-def test_a_restart_is_down_up_and_power_save_off_again(root: Path) -> None:
-    rig = Rig(root)
-    rig.look()
-    rig.wifi.heard()
-    assert rig.look(20.0) == [
-        "ip link set dev wlan0 down",
-        "ip link set dev wlan0 up",
-        "iw dev wlan0 set power_save off",
-        "iw dev wlan0 get power_save",
-    ]
 
 
 def test_a_ground_that_is_heard_or_was_never_heard_restarts_nothing(root: Path) -> None:

@@ -1,7 +1,7 @@
 """Each key of the payload's file has a test that sees what it does, and a new one needs its own."""
 
-import ast
-from pathlib import Path
+import importlib
+import inspect
 
 import pytest
 from test_firmware_settings import fields_of
@@ -144,17 +144,6 @@ A ground station is found on the interface that `telemetry.discover` names in
 """
 
 
-def source_of(test: str) -> str:
-    """The function's text with its decorators; fails when there is no such one."""
-    module, _, name = test.partition("::")
-    text = Path(__file__).with_name(f"test_firmware_{module}.py").read_text()
-    for node in ast.parse(text).body:
-        if isinstance(node, ast.FunctionDef) and node.name == name:
-            first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
-            return "\n".join(text.splitlines()[first - 1 : node.end_lineno])
-    raise AssertionError(f"there is no {test}")
-
-
 def test_each_key_of_the_settings_is_seen_and_nothing_else() -> None:
     seen = {key for keys in SEEN_BY.values() for key in keys}
     assert seen | {"telemetry.discover"} == {name for name, _ in fields_of(Settings)}
@@ -162,6 +151,7 @@ def test_each_key_of_the_settings_is_seen_and_nothing_else() -> None:
 
 @pytest.mark.parametrize("test", SEEN_BY)
 def test_each_of_these_tests_exists_and_says_its_keys(test: str) -> None:
-    source = source_of(test)
+    module, _, name = test.partition("::")
+    source = inspect.getsource(getattr(importlib.import_module(f"test_firmware_{module}"), name))
     for key in SEEN_BY[test]:
         assert key.rpartition(".")[2] in source, f"{test} does not mention {key}"

@@ -60,25 +60,6 @@ def test_an_encoder_that_stalls_is_started_anew_and_no_frame_is_lost_count_of(
     assert last.decoded == counted["sent"]
 
 
-def test_a_camera_that_goes_and_comes_back_streams_again(flying: Flying) -> None:
-    flying.start(
-        "camera.uri=test:?gone_at_s=1&gone_for_s=3",
-        ALL_FRAMES,
-        "supervision.frame_timeout_s=1",
-        "supervision.restarts=20",
-    )
-    state = flying.has(messages.EVENT_STREAMING_AGAIN)
-    restarted = [e for e in state.events if e.name == messages.EVENT_CAMERA_RESTARTED]
-    again = next(e for e in state.events if e.name == messages.EVENT_STREAMING_AGAIN)
-    assert restarted and "camera" in restarted[0].text
-    assert again.time_ns - restarted[0].time_ns < 15e9
-    sent = again.values["sent"]
-    flying.state(lambda s: s.frames is not None and s.frames.sent > sent + 30)
-    counted = numbers(flying.end())
-    assert counted["captured"] == counted["gated"] + counted["sent"] + counted.get("disc", 0)
-    assert flying.receiver.counters.packets_lost == 0
-
-
 def test_a_process_that_cannot_help_itself_ends_and_the_next_reboots_the_board(
     flying: Flying, tmp_path: Path
 ) -> None:

@@ -83,32 +83,6 @@ def test_a_link_with_a_key_sends_srtp_within_its_mtu(mtu_bytes: int) -> None:
     assert_secret(heard, KEY)
 
 
-def test_a_receiver_joins_a_link_whose_sequence_numbers_began_anew() -> None:
-    unit = stamped(encoded(FRAMES)[0], 0)
-    with eavesdropper(9) as (port, air):
-        link = Link(LinkSettings(port=port, mtu_bytes=200), 77, KEY)
-        link.start()
-        deadline = time.monotonic() + LIMIT_S
-        index = checked = 0
-        wrapped = False
-        while not (wrapped and len(air) > checked + 20):
-            assert time.monotonic() < deadline
-            if not link.send(unit, capture_ns(index), idr=True):
-                time.sleep(0.001)  # the link's queue is full
-                continue
-            index += 1
-            while not wrapped and checked + 1 < len(air):
-                before, after = (int.from_bytes(air[checked + n][2:4]) for n in (0, 1))
-                wrapped = after < before
-                checked += 1
-        link.flush()
-        link.stop()
-        late = air[checked + 1 :]
-    unprotector = Unprotector({"blimp-1": KEY})
-    assert all(unprotector.unprotect(datagram) is not None for datagram in late)
-    assert unprotector.tags_searched == 2  # it was the second counter
-
-
 @pytest.mark.parametrize(
     ("host", "encrypted", "key", "allowed"),
     [
