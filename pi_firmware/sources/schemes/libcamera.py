@@ -106,7 +106,7 @@ class LibcameraSource(LiveSource):
             self._element.set_property("camera-name", self._uri.path)
         for name, control in self._controls.items():
             if self._element.find_property(name) is not None:
-                gst.util_set_object_arg(self._element, name, _text(control.value))
+                gst.util_set_object_arg(self._element, name, str(control.value))
             elif not control.optional:
                 raise self._uri.fail(f"{control.config_key}: libcamerasrc here has no '{name}'")
         if self._controls:
@@ -176,11 +176,6 @@ class LibcameraSource(LiveSource):
         if self.error is None:
             self.error = self._uri.fail(reason)
             post_error(self._element, str(self.error))
-
-
-def _text(value: Any) -> str:
-    """A property's value as GStreamer reads it; booleans are `true` and `false` there."""
-    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 SOURCE = LibcameraSource
