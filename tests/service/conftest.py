@@ -1,8 +1,10 @@
-"""The application on a silent bus."""
+"""The application on a silent bus, and tests that are coroutines."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import inspect
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,19 @@ from ground_station.service.web.access import Buckets
 from ground_station.service.web.app import build
 
 HERE = "http://127.0.0.1:8080"
+ASYNC_LIMIT_S = 60.0
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """A test that is a coroutine is run to its end, within a minute."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    given = {
+        name: pyfuncitem.funcargs[name] for name in inspect.signature(pyfuncitem.obj).parameters
+    }
+    asyncio.run(asyncio.wait_for(pyfuncitem.obj(**given), ASYNC_LIMIT_S))
+    return True
 
 
 @contextlib.contextmanager

@@ -26,7 +26,3 @@ async def next_of(viewer, *kinds, limit_s=20.0):
                 found = json.loads(message)
             if found["type"] in kinds:
                 return found
-
-
-def run(main):
-    asyncio.run(asyncio.wait_for(main, 60.0))
