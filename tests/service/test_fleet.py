@@ -85,6 +85,10 @@ class Station:
         """As its page does four times a second."""
         self.fleet.publish_state(list(alarms), frozenset(wants), 0.5)
 
+    def flies(self, note: PayloadMessage = HERE) -> None:
+        """Its bus tells of the payload, which flies here, or as it is said."""
+        self.bus.publish(bus_messages.PAYLOAD, BLIMP, note)
+
     def others(self) -> list[str]:
         return [other["name"] for other in self.fleet.document()["stations"]]
 
@@ -116,14 +120,24 @@ def acquainted(*stations: Station) -> bool:
     return all(len(station.others()) == len(stations) - 1 for station in stations)
 
 
-def test_a_payload_that_flies_elsewhere_is_seen_here(stations: Any) -> None:
+Pair = tuple[Station, Station]
+
+
+@pytest.fixture
+def two(stations: Any) -> Pair:
+    """'hall', and 'attic', which joined it; they know each other."""
     hall = stations("hall")
     attic = stations("attic", hall.endpoint)
     eventually(lambda: acquainted(hall, attic), 20.0)
-    attic.bus.publish(bus_messages.PAYLOAD, BLIMP, PayloadMessage(True, 1, station="hall"))
+    return hall, attic
+
+
+def test_a_payload_that_flies_elsewhere_is_seen_here(two: Pair) -> None:
+    hall, attic = two
+    attic.flies(PayloadMessage(True, 1, station="hall"))
 
     def told() -> bool:
-        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        hall.flies()
         hall.bus.publish(bus_messages.ESTIMATE, BLIMP, POSE)
         note = attic.last(bus_messages.PAYLOAD)
         return note is not None and note.relayed and attic.last(bus_messages.ESTIMATE) is not None
@@ -140,19 +154,17 @@ def test_a_payload_that_flies_elsewhere_is_seen_here(stations: Any) -> None:
     assert attic.last(bus_messages.EVENT).text == "a word (station 'hall')"
     # What its own bus says of it, less, is not shown in between.
     before = len(attic.heard)
-    attic.bus.publish(bus_messages.PAYLOAD, BLIMP, PayloadMessage(True, 1, station="hall"))
-    hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+    attic.flies(PayloadMessage(True, 1, station="hall"))
+    hall.flies()
     eventually(lambda: len(attic.heard) > before, 10.0)
     assert all(note.relayed for kind, _, note in attic.heard[before:] if kind == "payload")
 
 
-def test_pictures_cross_only_while_somebody_looks(stations: Any) -> None:
-    hall = stations("hall")
-    attic = stations("attic", hall.endpoint)
-    eventually(lambda: acquainted(hall, attic), 20.0)
+def test_pictures_cross_only_while_somebody_looks(two: Pair) -> None:
+    hall, attic = two
 
     def shown(*wants: str) -> bool:
-        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        hall.flies()
         attic.tell(*wants)
         hall.fleet.picture(BLIMP, b"JPEG")
         return bool(attic.pictures)
@@ -164,16 +176,14 @@ def test_pictures_cross_only_while_somebody_looks(stations: Any) -> None:
     assert attic.pictures[0] == (BLIMP, b"JPEG") and hall.fleet.where.wanted() == {BLIMP}
 
 
-def test_commands_go_to_the_station_that_has_the_payload_and_all_are_told(stations: Any) -> None:
-    hall = stations("hall")
-    attic = stations("attic", hall.endpoint)
-    eventually(lambda: acquainted(hall, attic), 20.0)
+def test_commands_go_to_the_station_that_has_the_payload_and_all_are_told(two: Pair) -> None:
+    hall, attic = two
     asked = []
     hall.bus.serve(f"localizer/{BLIMP}", lambda request: {"values": asked.append(request) or {}})
     hall.bus.serve("intake", lambda request: {"values": asked.append(request) or {}})
 
     def there() -> bool:
-        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        hall.flies()
         return attic.last(bus_messages.PAYLOAD) is not None
 
     eventually(there, 10.0)
@@ -208,10 +218,8 @@ class Shelf:
         yield (bytes(range(256)) * 1200)[begin:end]
 
 
-def test_recordings_are_read_where_they_lie(stations: Any) -> None:
-    hall = stations("hall")
-    attic = stations("attic", hall.endpoint)
-    eventually(lambda: acquainted(hall, attic), 20.0)
+def test_recordings_are_read_where_they_lie(two: Pair) -> None:
+    hall, attic = two
     hall.fleet.shelf = Shelf()
     shelf = attic.fleet.shelf_of("hall")
     assert shelf.list() == Shelf().list() and attic.fleet.where.knows("hall")
@@ -226,10 +234,8 @@ def test_recordings_are_read_where_they_lie(stations: Any) -> None:
         shelf.list()
 
 
-def test_a_recording_is_played_where_it_does_not_lie(stations: Any, tmp_path: Path) -> None:
-    hall = stations("hall")
-    attic = stations("attic", hall.endpoint)
-    eventually(lambda: acquainted(hall, attic), 20.0)
+def test_a_recording_is_played_where_it_does_not_lie(two: Pair, tmp_path: Path) -> None:
+    hall, attic = two
     path = tape_stand.write(tmp_path / "flight.mcap")
     hall.fleet.shelf = Recordings(tmp_path, lambda: "")
     shelf = attic.fleet.shelf_of("hall")
@@ -258,10 +264,8 @@ def test_a_pose_recorded_elsewhere_has_this_station_s_name_of_the_map(stations: 
         assert hall.fleet.named(note) == note
 
 
-def test_a_flight_that_was_recorded_where_it_was_goes_on_being_recorded(stations: Any) -> None:
-    hall = stations("hall")
-    attic = stations("attic", hall.endpoint)
-    eventually(lambda: acquainted(hall, attic), 20.0)
+def test_a_flight_that_was_recorded_where_it_was_goes_on_being_recorded(two: Pair) -> None:
+    hall, attic = two
     asked = []
 
     def intake(request: Any) -> dict[str, Any]:
@@ -272,7 +276,7 @@ def test_a_flight_that_was_recorded_where_it_was_goes_on_being_recorded(stations
     written = RecordingMessage(active=True, file="hall-7.mcap")
 
     def recorded() -> bool:
-        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        hall.flies()
         hall.bus.publish(bus_messages.RECORDING, "-", written)
         hall.tell()
         there = attic.last(bus_messages.PAYLOAD)
@@ -281,19 +285,17 @@ def test_a_flight_that_was_recorded_where_it_was_goes_on_being_recorded(stations
     eventually(recorded, 10.0)
     assert asked == []
     hall.stack.close()
-    attic.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+    attic.flies()
     eventually(lambda: bool(asked), 10.0)
     assert asked == [{"do": "record-start", "after": "hall/hall-7.mcap"}]
     eventually(lambda: "hall/hall-7.mcap" in str(attic.last(bus_messages.EVENT)), 10.0)
-    attic.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+    attic.flies()
     time.sleep(0.3)
     assert len(asked) == 1
 
 
-def test_alarms_are_told_once_with_their_station(stations: Any) -> None:
-    hall = stations("hall")
-    attic = stations("attic", hall.endpoint)
-    eventually(lambda: acquainted(hall, attic), 20.0)
+def test_alarms_are_told_once_with_their_station(two: Pair) -> None:
+    hall, attic = two
     found = [
         Alarm("disk", "warning", "-", "little left"),
         Alarm(f"battery/{BLIMP}", "alarm", BLIMP, "battery low"),
@@ -303,7 +305,7 @@ def test_alarms_are_told_once_with_their_station(stations: Any) -> None:
     ]
 
     def told() -> bool:
-        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        hall.flies()
         hall.tell(alarms=found)
         return len(attic.fleet.where.alarms()) > 1
 
@@ -314,19 +316,17 @@ def test_alarms_are_told_once_with_their_station(stations: Any) -> None:
     ]
 
 
-def test_two_payloads_of_one_name_are_said_and_the_own_one_is_shown(stations: Any) -> None:
-    hall = stations("hall")
-    attic = stations("attic", hall.endpoint)
-    eventually(lambda: acquainted(hall, attic), 20.0)
+def test_two_payloads_of_one_name_are_said_and_the_own_one_is_shown(two: Pair) -> None:
+    hall, attic = two
     twin = PayloadMessage(alive=True, seen_ns=1, ssrc=9, rate_hz=10.0)
 
     def found() -> Any:
-        attic.bus.publish(bus_messages.PAYLOAD, BLIMP, twin)
-        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        attic.flies(twin)
+        hall.flies()
         return attic.fleet.document()["twins"]
 
     def known() -> bool:
-        attic.bus.publish(bus_messages.PAYLOAD, BLIMP, twin)
+        attic.flies(twin)
         return attic.last(bus_messages.PAYLOAD) is not None
 
     # What flies here has to be known before another station tells of its own.
@@ -353,7 +353,7 @@ def test_poses_from_elsewhere_are_told_to_this_station_by_its_own_name_of_the_ma
         # By turns, as a station tells not of every one.
         other = replace(POSE, map="hall", sequence=2) if len(sent) % 8 < 4 else POSE
         sent.append(None)
-        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        hall.flies()
         hall.bus.publish(bus_messages.ESTIMATE, BLIMP, other)
         return bool(told)
 
@@ -372,7 +372,7 @@ def test_poses_in_another_map_are_not_taken(stations: Any, tmp_path: Path) -> No
     eventually(lambda: acquainted(hall, attic), 20.0)
 
     def told() -> bool:
-        hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        hall.flies()
         hall.bus.publish(bus_messages.ESTIMATE, BLIMP, POSE)
         return len([1 for kind, _, _ in attic.heard if kind == "payload"]) > 3
 
@@ -389,7 +389,7 @@ def test_a_third_station_is_found_through_the_first_and_stays_when_that_goes(sta
     attic.heard.clear()
 
     def told() -> bool:
-        yard.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        yard.flies()
         note = attic.last(bus_messages.PAYLOAD)
         return note is not None and note.station == "yard"
 
@@ -402,7 +402,7 @@ def test_a_network_that_is_cut_costs_nothing_once_it_is_back(stations: Any) -> N
         attic = stations("attic", f"tls/127.0.0.1:{wire.port}", more=("fleet.listen=[]",))
 
         def seen(at: Station, station: str) -> bool:
-            hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+            hall.flies()
             attic.bus.publish(bus_messages.PAYLOAD, "blimp-2", HERE)
             for one in (hall, attic):
                 one.tell()
@@ -447,7 +447,7 @@ def test_whoever_is_revoked_or_foreign_is_refused_and_named(stations: Any, tmp_p
 
     def said() -> bool:
         gone.tell()
-        gone.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+        gone.flies()
         return bool(later.fleet.document()["refused"])
 
     eventually(said, 30.0)
@@ -469,10 +469,8 @@ def test_whose_certificate_has_ended_is_refused_and_told_why(stations: Any) -> N
     assert hall.others() == [] and yard.others() == []
 
 
-def test_what_is_no_message_is_counted_and_dropped(stations: Any) -> None:
-    hall = stations("hall")
-    attic = stations("attic", hall.endpoint)
-    eventually(lambda: acquainted(hall, attic), 20.0)
+def test_what_is_no_message_is_counted_and_dropped(two: Pair) -> None:
+    hall, attic = two
     session = hall.fleet._session.zenoh
     for k in range(100):
         session.put(f"fleet/hall/payload/blimp-{k}", bus_messages.encode(HERE))
@@ -570,7 +568,7 @@ def test_a_map_that_grew_elsewhere_is_offered_and_its_poses_are_ours(
         note = replace(POSE, map=map_name, coordinates=coordinates)
         attic.heard.clear()
         for _ in range(3):
-            hall.bus.publish(bus_messages.PAYLOAD, BLIMP, HERE)
+            hall.flies()
             hall.bus.publish(bus_messages.ESTIMATE, BLIMP, note)
             time.sleep(0.2)
         found: EstimateMessage | None = attic.last(bus_messages.ESTIMATE)
