@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import base64
 import json
-import os
-import signal
 import struct
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -16,21 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import stand
 from google.protobuf import descriptor_pool, message_factory
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from stand import program
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
-from ground_station.service import bus_messages, settings
-from ground_station.service.bus import Bus, Router
-from ground_station.service.bus_messages import EstimateMessage, FrameMessage, ProcessMessage
-from ground_station.service.pictures import PictureWriter
-from ground_station.service.settings import Run
-from pi_firmware.wire.config import from_mapping
+from ground_station.service.bus_messages import EstimateMessage, FrameMessage
 
-ROOT = Path(__file__).parents[2]
-SAMPLE = ROOT / "maps" / "atrium"
-PAYLOAD = "blimp-1"
 LIMIT_S = 60.0
 CAPTURE_NS = 1_790_000_000_123_456_789
 
@@ -55,65 +46,24 @@ def estimate(sequence: int = 7, **fields: Any) -> EstimateMessage:
     return EstimateMessage(**(values | fields))
 
 
-class Station:
-    """The bus with what the process says on it, and the voices of intake and localizer."""
+class Station(stand.Station):
+    """The voices of intake and localizer on a bus."""
 
     def __init__(self, folder: Path, **foxglove: Any) -> None:
-        self.folder = folder
-        station = {
-            "map": {"folder": str(SAMPLE), "shelf": str(SAMPLE.parent)},
-            "foxglove": {"port": 0, **foxglove},
-        }
-        settings.write_run(folder, from_mapping({"station": station}, Run, where="test"))
-        self.pictures = PictureWriter(folder, PAYLOAD)
-        self.open()
+        super().__init__(folder, foxglove={"port": 0, **foxglove})
 
-    def open(self) -> None:
-        self.beats: list[ProcessMessage] = []
-        self.router = Router(self.folder)
-        self.bus = Bus(self.folder, "station")
-        self.bus.subscribe(
-            bus_messages.PROCESS, ProcessMessage, lambda _, note: self.beats.append(note)
-        )
-
-    def close(self) -> None:
-        self.bus.close()
-        self.router.close()
-
-    def say(self, note: EstimateMessage, payload_id: str = PAYLOAD) -> None:
-        self.bus.publish(bus_messages.ESTIMATE, payload_id, note)
-
-    def show(self, image: Any, sequence: int, **fields: Any) -> None:
-        slot, stamp = self.pictures.write(image)
-        values: dict[str, Any] = {
-            "slot": slot,
-            "stamp": stamp,
-            "sequence": sequence,
-            "time_ns": 5,
-            "clock_ns": 6,
-            "capture_ns": CAPTURE_NS,
-            "arrival_ns": CAPTURE_NS + 9_000_000,
-            "width_px": image.shape[1],
-            "height_px": image.shape[0],
-            "ssrc": 1,
-        }
-        self.bus.publish(bus_messages.FRAME, PAYLOAD, FrameMessage(**(values | fields)))
+    def show(self, image: Any, sequence: int, **fields: Any) -> FrameMessage:
+        return super().show(image, sequence, **{"capture_ns": CAPTURE_NS, **fields})
 
 
 @contextmanager
 def server(folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """The process, as the service starts it, and its port."""
-    command = [sys.executable, "-m", "ground_station.service.foxglove", str(folder)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT)
-    try:
+    with program("foxglove", str(folder), stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         line = process.stdout.readline()
         assert line.startswith("foxglove: ws://"), line
         yield process, int(line.rpartition(":")[2])
-    finally:
-        if process.poll() is None:
-            os.kill(process.pid, signal.SIGKILL)
-        process.communicate()
 
 
 class Client:

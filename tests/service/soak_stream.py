@@ -24,7 +24,7 @@ from typing import Any
 
 import intake_stand  # noqa: F401 - it says where the other rooms' helpers are
 import numpy as np
-from localizing_stand import LIMIT_S, PAYLOAD, SAMPLE, localizer, station
+from localizing_stand import LIMIT_S, PAYLOAD, SAMPLE, Station, localizer
 from soaking import report
 from soaking.arguments import MOST_HOURS, Parser, number, on_interrupt
 from soaking.judging import rows as slope_rows
@@ -79,7 +79,7 @@ def fly(options: Any, flown: Flown, interrupted: threading.Event) -> None:
     said: queue.SimpleQueue[EstimateMessage] = queue.SimpleQueue()
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        told = stack.enter_context(station(folder))
+        told = stack.enter_context(Station(folder))
         process = stack.enter_context(localizer(folder))
         told.bus.subscribe(
             bus_messages.ESTIMATE, EstimateMessage, lambda _, note: said.put(note), PAYLOAD

@@ -7,7 +7,8 @@ import re
 from typing import Any
 
 import pytest
-from test_foxglove_server import PAYLOAD, SCHEMAS
+from notes import PAYLOAD
+from test_foxglove_server import SCHEMAS
 
 from ground_station.service.foxglove import documents, layout
 from pi_firmware.wire.errors import BlimpError

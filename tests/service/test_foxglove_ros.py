@@ -14,7 +14,9 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
-from foxglove_stand import PAYLOAD, ROOT, Station, estimate, server
+from foxglove_stand import Station, estimate, server
+from notes import PAYLOAD
+from stand import ROOT
 from waiting import eventually
 
 from pi_firmware import __version__
@@ -61,12 +63,8 @@ class Ros:
 
 @pytest.fixture
 def station(tmp_path: Path) -> Iterator[SimpleNamespace]:
-    said = Station(tmp_path)
-    try:
-        with server(said.folder) as (process, port):
-            yield SimpleNamespace(said=said, process=process, port=port)
-    finally:
-        said.close()
+    with Station(tmp_path) as said, server(tmp_path) as (process, port):
+        yield SimpleNamespace(said=said, process=process, port=port)
 
 
 def test_it_publishes_poses_with_their_covariance_and_waits_for_a_station_that_is_gone(

@@ -8,7 +8,6 @@ import math
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +18,9 @@ import cv2
 import numpy as np
 import pytest
 from foxglove import Context
-from foxglove_stand import CAPTURE_NS, PAYLOAD, ROOT, Client, Station, estimate, server
+from foxglove_stand import CAPTURE_NS, Client, Station, estimate, server
+from notes import PAYLOAD
+from stand import SAMPLE, program
 from waiting import eventually
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -63,13 +64,10 @@ SCHEMAS = {
 @pytest.fixture(scope="module")
 def stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace]:
     """One process for all tests that leave it as it was."""
-    station = Station(tmp_path_factory.mktemp("run"))
-    try:
-        with server(station.folder) as (process, port):
-            yield SimpleNamespace(station=station, process=process, port=port)
-            assert process.poll() is None
-    finally:
-        station.close()
+    folder = tmp_path_factory.mktemp("run")
+    with Station(folder) as station, server(folder) as (process, port):
+        yield SimpleNamespace(station=station, process=process, port=port)
+        assert process.poll() is None
 
 
 def close(a: Any, *b: float) -> bool:
@@ -293,7 +291,7 @@ def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(
             first.drain()
             assert {topic: len(first.received[topic]) for topic in kept} == before
             told = {topic: second.received[topic][0] for topic in kept}
-    camera: Camera = store.load_info(ROOT / "maps" / "atrium").camera
+    camera: Camera = store.load_info(SAMPLE).camera
     _, calibration = told[f"/{PAYLOAD}/camera/calibration"]
     assert calibration.frame_id == f"{PAYLOAD}/camera_optical"
     assert (calibration.width, calibration.height) == (640, 480)
@@ -312,7 +310,7 @@ def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(
     assert grid.cell_size.x == 0.025 and close(grid.pose.position, -0.75, -0.75, 0)
     points = np.frombuffer(cloud.data, "<f4").reshape(-1, 3)
     assert 1000 < len(points) <= 20_000
-    truth = store.load(ROOT / "maps" / "atrium").landmarks.position_m.astype("<f4")
+    truth = store.load(SAMPLE).landmarks.position_m.astype("<f4")
     assert {tuple(point) for point in points.tolist()} <= {tuple(p) for p in truth.tolist()}
 
 
@@ -390,39 +388,37 @@ def test_another_protocol_is_refused(stand: SimpleNamespace) -> None:
 
 
 def test_a_bus_that_comes_back_is_heard_again(tmp_path: Path) -> None:
-    station = Station(tmp_path)
-    try:
-        with server(tmp_path) as (process, port), Client(port) as client:
-            station.say(estimate())
-            client.subscribe(f"/{PAYLOAD}/estimate")
-            client.first(f"/{PAYLOAD}/estimate", lambda: station.say(estimate()))
-            station.close()
-            station.open()
-            client.until(
-                lambda: client.received[f"/{PAYLOAD}/estimate"][-1][1]["sequence"] == 8,
-                "the next",
-                lambda: station.say(estimate(8)),
-            )
-            eventually(lambda: bool(station.beats), what="beat")
-            # With a client and a map being asked for, it still ends when it is told to.
-            client.subscribe("/map/landmarks")
-            process.send_signal(signal.SIGTERM)
-            assert process.wait(10) == 0
-    finally:
+    topic = f"/{PAYLOAD}/estimate"
+    with (
+        Station(tmp_path) as station,
+        server(tmp_path) as (process, port),
+        Client(port) as client,
+    ):
+        station.say(estimate())
+        client.subscribe(topic)
+        client.first(topic, lambda: station.say(estimate()))
         station.close()
+        station.open()
+        client.until(
+            lambda: client.received[topic][-1][1]["sequence"] == 8,
+            "the next",
+            lambda: station.say(estimate(8)),
+        )
+        eventually(lambda: bool(station.beats), what="beat")
+        # With a client and a map being asked for, it still ends when it is told to.
+        client.subscribe("/map/landmarks")
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 0
 
 
 def test_a_port_that_is_taken_is_told_in_one_line(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        station = Station(tmp_path, port=port)
-        try:
-            command = [sys.executable, "-m", "ground_station.service.foxglove", str(tmp_path)]
-            done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
-        finally:
-            station.close()
-    assert done.returncode == 2 and done.stdout == ""
-    (line,) = done.stderr.splitlines()
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+        with Station(tmp_path, port=port), program("foxglove", str(tmp_path), **pipes) as process:
+            out, err = process.communicate(timeout=60)
+    assert process.returncode == 2 and out == ""
+    (line,) = err.splitlines()
     assert f"foxglove.port {port}" in line and "in use" in line
 
 
@@ -457,17 +453,12 @@ def test_a_full_inbox_loses_the_oldest() -> None:
 
 def test_a_payload_that_is_gone_gives_its_place_to_a_new_one(tmp_path: Path) -> None:
     """The 33rd of an evening had no topics until a restart."""
-    station = Station(tmp_path)
-    try:
-        with server(station.folder) as (_, port), Client(port) as client:
-            for number in range(PAYLOADS + 2):
-                name = f"flown-{number}"
-                for alive in (True, False):
-                    note = PayloadMessage(alive, 0)
-                    station.bus.publish(bus_messages.PAYLOAD, name, note)
-                topic = f"/{name}/status"
-                client.until(lambda topic=topic: topic in client.channels, topic)
-            client.until(lambda: "/flown-1/status" not in client.channels, "the end of its topics")
-            assert f"/flown-{PAYLOADS + 1}/status" in client.channels
-    finally:
-        station.close()
+    with Station(tmp_path) as station, server(tmp_path) as (_, port), Client(port) as client:
+        for number in range(PAYLOADS + 2):
+            name = f"flown-{number}"
+            for alive in (True, False):
+                station.bus.publish(bus_messages.PAYLOAD, name, PayloadMessage(alive, 0))
+            topic = f"/{name}/status"
+            client.until(lambda topic=topic: topic in client.channels, topic)
+        client.until(lambda: "/flown-1/status" not in client.channels, "the end of its topics")
+        assert f"/flown-{PAYLOADS + 1}/status" in client.channels

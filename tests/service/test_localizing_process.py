@@ -18,16 +18,14 @@ import zenoh
 from localizing_stand import (
     LIMIT_S,
     NAME,
-    PAYLOAD,
-    ROOT,
-    SAMPLE,
     Intake,
     Station,
     copy_map,
     localizer,
     payload,
-    station,
 )
+from notes import PAYLOAD
+from stand import ROOT, SAMPLE
 from waiting import eventually
 
 from ground_station.localization.localizer import Localizer
@@ -68,7 +66,7 @@ def kept(
 ) -> Iterator[tuple[Station, subprocess.Popen[str]]]:
     """One localizer that has loaded its map, for all tests that leave it as it was."""
     folder = tmp_path_factory.mktemp("run")
-    with station(folder, shelf=str(shelf)) as told, localizer(folder) as process:
+    with Station(folder, shelf=str(shelf)) as told, localizer(folder) as process:
         eventually(lambda: told.event("map-loaded") is not None, what="the map")
         yield told, process
 
@@ -225,7 +223,7 @@ def test_without_a_map_it_stays_says_so_and_takes_another(
     tmp_path: Path, shelf: Path, flight: list[Frame]
 ) -> None:
     with (
-        station(tmp_path, folder=str(shelf / "cut"), shelf=str(shelf)) as told,
+        Station(tmp_path, folder=str(shelf / "cut"), shelf=str(shelf)) as told,
         localizer(tmp_path) as process,
     ):
         eventually(lambda: told.event("map-refused") is not None, what="the refusal")
@@ -354,7 +352,7 @@ def test_while_its_map_is_loaded_it_says_so(
         return real(*arguments)
 
     monkeypatch.setattr(maps, "prepare", slow)
-    with station(tmp_path) as told, Bus(tmp_path, NAME) as bus:
+    with Station(tmp_path) as told, Bus(tmp_path, NAME) as bus:
         localizing = Localizing(bus, tmp_path, PAYLOAD, told.run)
         thread = threading.Thread(target=localizing.run, args=(stop,))
         thread.start()
@@ -402,7 +400,7 @@ def test_failures_are_counted_and_ten_in_a_row_end_it(
     failing = _Failing(monkeypatch, times)
     ended: list[int] = []
     stop = threading.Event()
-    with station(tmp_path) as told, Bus(tmp_path, NAME) as bus:
+    with Station(tmp_path) as told, Bus(tmp_path, NAME) as bus:
         localizing = Localizing(bus, tmp_path, PAYLOAD, told.run)
         thread = threading.Thread(target=lambda: ended.append(localizing.run(stop)))
         thread.start()
@@ -435,7 +433,7 @@ def test_a_localizer_that_is_killed_is_counted_on_and_another_session_anew(
     def with_a_map(before: int = 0) -> bool:
         return "map-loaded" in [event.name for event in told.events[before:]]
 
-    with station(tmp_path) as told:
+    with Station(tmp_path) as told:
         with localizer(tmp_path) as process:
             eventually(with_a_map, what="the map")
             for frame in flight[:3]:

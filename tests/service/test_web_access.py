@@ -11,40 +11,33 @@ from starlette.websockets import WebSocketDisconnect
 from ground_station.service.settings import HttpSettings
 from ground_station.service.web import access
 from ground_station.service.web.access import Access, AccessError, Buckets, Refused, read_token
-from ground_station.service.web.app import build
 from ground_station.service.web.guard import BODY_BYTES
 
-HERE = "http://127.0.0.1:8080"
+HERE = station.HERE
 LIVE = "ws://127.0.0.1:8080/api/live"
 BEARER = {"authorization": f"Bearer {station.TOKEN}"}
 OWN = {"origin": HERE}
 
 
-def asked(folder, token=None):
-    bus = station.SilentBus()
-    web = build(station.run_of(folder), folder, bus, token)
-    with station.TestClient(web.guarded, HERE, follow_redirects=False) as client:
-        station.say_all(bus.put)
-        yield client, web
-
-
 @pytest.fixture(scope="module")
 def opened_once(tmp_path_factory):
-    yield from asked(tmp_path_factory.mktemp("opened"))
+    with station.application(tmp_path_factory.mktemp("opened")) as parts:
+        yield parts
 
 
 @pytest.fixture(scope="module")
 def closed_once(tmp_path_factory):
-    yield from asked(tmp_path_factory.mktemp("closed"), station.TOKEN)
+    with station.application(tmp_path_factory.mktemp("closed"), station.TOKEN) as parts:
+        yield parts
 
 
 def fresh(parts):
     """As at its start: nobody is logged in, nobody has asked."""
-    client, web = parts
+    client, _, web = parts
     client.cookies.clear()
     web.access.sessions._until_s.clear()
     web.access.posts, web.access.failures = Buckets(10.0, 30), Buckets(1 / 12, 5)
-    return parts
+    return client, web
 
 
 @pytest.fixture

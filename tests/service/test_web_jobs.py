@@ -16,7 +16,6 @@ import pytest
 import web_station as station
 
 from ground_station.errors import GroundStationError
-from ground_station.service.bus import Router
 from ground_station.service.settings import write_run
 from ground_station.service.web import jobs as jobs_module
 from ground_station.service.web.jobs import Jobs
@@ -119,36 +118,32 @@ def test_what_is_left_of_a_killed_run_is_no_job(tmp_path: Path) -> None:
 
 
 def test_a_job_outlives_a_killed_web_process_and_ends_with_the_service(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bus_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from ground_station.calibration.board import new_board, write_board
 
-    monkeypatch.chdir(tmp_path)
-    write_run(tmp_path, station.run_of(tmp_path))
-    write_board(tmp_path / "board.toml", new_board(10, 7, 25.0))
-    shutil.copy(station.ATRIUM / "flight.mcap", tmp_path / "recordings" / "a.mcap")
-    router = Router(tmp_path)
+    monkeypatch.chdir(bus_folder)
+    write_run(bus_folder, station.run_of(bus_folder))
+    write_board(bus_folder / "board.toml", new_board(10, 7, 25.0))
+    shutil.copy(station.ATRIUM / "flight.mcap", bus_folder / "recordings" / "a.mcap")
 
     def job(port: int) -> dict[str, Any]:
         found = httpx.get(f"http://127.0.0.1:{port}/api/state", timeout=20.0).json()["job"]
         return dict(found or {})
 
-    try:
-        with station.web_process(tmp_path) as (process, port):
-            asked = {"step": "calibrate", "choice": "a.mcap"}
-            answer = httpx.post(f"http://127.0.0.1:{port}/api/job", json=asked, timeout=20.0)
-            assert answer.json()["done"], answer.text
-            before = job(port)
-            process.kill()
-        with station.web_process(tmp_path) as (process, port):
-            after = job(port)
-            assert after["started_ns"] == before["started_ns"]
-            assert after["running"] or after["status"] is not None  # it was not killed, too
-            process.send_signal(signal.SIGTERM)
-            assert process.wait(30.0) == 0
-        assert not (Jobs(tmp_path).state() or {})["running"]
-    finally:
-        router.close()
+    with station.web_process(bus_folder) as (process, port):
+        asked = {"step": "calibrate", "choice": "a.mcap"}
+        answer = httpx.post(f"http://127.0.0.1:{port}/api/job", json=asked, timeout=20.0)
+        assert answer.json()["done"], answer.text
+        before = job(port)
+        process.kill()
+    with station.web_process(bus_folder) as (process, port):
+        after = job(port)
+        assert after["started_ns"] == before["started_ns"]
+        assert after["running"] or after["status"] is not None  # it was not killed, too
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30.0) == 0
+    assert not (Jobs(bus_folder).state() or {})["running"]
 
 
 def test_only_what_is_there_is_built_and_nothing_is_overwritten(
