@@ -45,15 +45,6 @@ def estimate(**fields: object) -> PoseEstimate:
     return PoseEstimate(**(values | fields))  # type: ignore[arg-type]
 
 
-def test_covariance_turns_with_the_camera() -> None:
-    """Deviations of 1, 2 and 3 m along the camera's axes lie along the world's x, -z and y."""
-    covariance = np.diag([9.0, 9.0, 9.0, 1.0, 4.0, 9.0])
-    covariance[3, 4] = covariance[4, 3] = 0.5  # camera's x with y (down): world's x with -z
-    expected = [[1.0, 0, -0.5], [0, 9, 0], [-0.5, 0, 4]]
-    wTc = poses.pose(ALONG_Y, [5.0, 6.0, 7.0])
-    assert np.allclose(position_covariance(wTc, covariance), expected, atol=1e-12)
-
-
 def test_covariance_is_that_of_steps_on_the_tangent() -> None:
     """Against the exponential map itself, with rotation and translation correlated."""
     rng = np.random.default_rng(1)

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,8 @@ import pytest
 from waiting import eventually
 
 from ground_station.service import bus_messages, processes, settings
-from ground_station.service.bus import Bus, Router
-from ground_station.service.bus_messages import EventMessage, FrameMessage, PayloadMessage
+from ground_station.service.bus import Bus
+from ground_station.service.bus_messages import EventMessage, PayloadMessage
 from ground_station.service.pictures import SLOTS, PictureReader, PictureWriter, path_of
 from ground_station.service.processes import Child, Children, ServiceError, Spec
 from pi_firmware.wire.errors import BlimpError, ConfigError
@@ -38,13 +37,6 @@ def modules(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / f"stand_in_{name}.py").write_text(text)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     return tmp_path
-
-
-@pytest.fixture
-def bus_folder(tmp_path: Path) -> Iterator[Path]:
-    router = Router(tmp_path)
-    yield tmp_path
-    router.close()
 
 
 class Time:
@@ -292,11 +284,6 @@ def test_a_picture_is_read_whole_or_not_at_all(tmp_path: Path) -> None:
     assert reader.read(slot, stamp) is None
     path_of(tmp_path, "b").write_bytes(b"nonsense" * 100)
     assert reader.read(slot, stamp) is None
-
-
-def test_a_frames_note_survives_json() -> None:
-    note = FrameMessage(1, 2, 3, 4, 5, 6, 640, 480, 7, exposure_s=0.01)
-    assert bus_messages.decode(FrameMessage, bus_messages.encode(note)) == note
 
 
 def test_the_shipped_file_documents_every_key() -> None:
