@@ -20,11 +20,13 @@ from ground_station.recording.frames import (
     Frame,
     FrameRange,
     plausible_exposure_s,
+    write_calibration,
 )
 from ground_station.recording.h264 import Decoder, grey
 from ground_station.recording.video import check_given, frame_name
 from pi_firmware.wire import annexb, config, sei
 from pi_firmware.wire.recording import (
+    CALIBRATION_TOPIC,
     FRAME_INFO_TOPIC,
     TRUTH_TOPIC,
     VIDEO_TOPIC,
@@ -183,14 +185,7 @@ def camera_of(reader: RecordingReader) -> Camera | None:
 def write_camera(writer: RecordingWriter, camera: Camera, time_ns: int) -> None:
     """Writes what `camera_of` reads: the calibration, and the camera's numbers as metadata."""
     writer.write_metadata(CAMERA_TABLE, {k: str(v) for k, v in camera.as_dict().items()})
-    writer.write_calibration(
-        time_ns,
-        width_px=camera.width_px,
-        height_px=camera.height_px,
-        matrix=camera.matrix.ravel().tolist(),
-        distortion=camera.distortion.tolist(),
-        distortion_model=camera.distortion_model,
-    )
+    write_calibration(writer, camera, time_ns, CALIBRATION_TOPIC)
 
 
 def trajectory_of(

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from ground_station.arrays import U8
 from ground_station.geometry.camera import Camera
+
+if TYPE_CHECKING:
+    from pi_firmware.wire.recording import RecordingWriter
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,19 @@ ALL_FRAMES = FrameRange()
 
 CAMERA_TABLE = "camera"
 """A recording's metadata table that may hold `readout_s`, which no Foxglove message has."""
+
+
+def write_calibration(writer: RecordingWriter, camera: Camera, time_ns: int, topic: str) -> None:
+    """Writes a camera's calibration as of a time, without what no Foxglove message has."""
+    writer.write_calibration(
+        time_ns,
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        matrix=camera.matrix.ravel().tolist(),
+        distortion=camera.distortion.tolist(),
+        distortion_model=camera.distortion_model,
+        topic=topic,
+    )
 
 
 class FrameSource(Protocol):

@@ -120,9 +120,9 @@ class Heard:
 
 
 class Stand:
-    """A run of the intake; a context manager that ends whatever it started."""
+    """A run of the intake, unless not `served`; a context manager that ends what it started."""
 
-    def __init__(self, folder: Path, **tables: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, *, served: bool = True, **tables: dict[str, Any]) -> None:
         self.folder = folder
         self.run_folder = folder / "run"
         self.run_folder.mkdir()
@@ -142,14 +142,15 @@ class Stand:
         write_run(self.run_folder, Run(self.settings))
         self.recording = flight(folder)
         self._stack = contextlib.ExitStack()
-        self._count = 0
+        self._served, self._count = served, 0
 
     def __enter__(self) -> Stand:
         router = Router(self.run_folder)
         self._stack.callback(router.close)
         self.bus = self._stack.enter_context(Bus(self.run_folder, "test"))
         self.heard = Heard(self.bus, self.run_folder)
-        self.start()
+        if self._served:
+            self.start()
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -8,7 +8,6 @@ as `/blimp-2/camera/video`. Telemetry lies under its Zenoh key, as `/blimp/blimp
 
 from __future__ import annotations
 
-import contextlib
 import json
 import time
 from collections import Counter
@@ -17,7 +16,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from ground_station.geometry.camera import Camera
-from ground_station.recording.frames import CAMERA_TABLE
+from ground_station.recording.frames import CAMERA_TABLE, write_calibration
 from ground_station.service import bus_messages
 from ground_station.service.bus_messages import EstimateMessage
 from pi_firmware.wire import annexb
@@ -124,9 +123,7 @@ class GroundRun(run.Run):
                 self._count(*item.account)
             self._write_message(item.topic, item.schema, item.log_ns, item.text)
         elif isinstance(item, Estimated):
-            # Numbers that are none are a localizer's error, and no reason to end a recording.
-            with contextlib.suppress(TypeError, ValueError, KeyError):
-                self._estimate(item)
+            self._estimate(item)
 
     def _unit(self, unit: Unit) -> None:
         log_ns = unit.info.time_ns if unit.log_ns is None else unit.log_ns
@@ -184,15 +181,8 @@ class GroundRun(run.Run):
         camera = self._camera
         if camera is None or self._sizes.get(payload_id) != (camera.width_px, camera.height_px):
             return
-        self._current.writer.write_calibration(
-            log_ns,
-            width_px=camera.width_px,
-            height_px=camera.height_px,
-            matrix=camera.matrix.ravel().tolist(),
-            distortion=camera.distortion.tolist(),
-            distortion_model=camera.distortion_model,
-            topic=stream.prefix + CALIBRATION_TOPIC,
-        )
+        topic = stream.prefix + CALIBRATION_TOPIC
+        write_calibration(self._current.writer, camera, log_ns, topic)
         self._current.added(500)
 
     def _estimate(self, item: Estimated) -> None:
