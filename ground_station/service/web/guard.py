@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
 
+from prometheus_client import Counter
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, RedirectResponse, Response
@@ -37,7 +37,7 @@ class Guard:
     counted in `answers` by method and status class.
     """
 
-    def __init__(self, app: ASGIApp, access: Access, answers: Counter[tuple[str, str]]) -> None:
+    def __init__(self, app: ASGIApp, access: Access, answers: Counter) -> None:
         self._app, self._access, self._answers = app, access, answers
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -57,7 +57,7 @@ class Guard:
             await self._refuse(scope, receive, refused, answer)
         finally:
             known = method if method in (*_SAFE, "POST", "DELETE", "WS") else "other"
-            self._answers[known, answer.status_class] += 1
+            self._answers.labels(known, answer.status_class).inc()
 
     def _check(self, scope: Scope, method: str) -> None:
         headers = Headers(scope=scope)

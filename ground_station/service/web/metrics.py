@@ -7,20 +7,22 @@ at each scrape; labels are bounded as the snapshot is.
 from __future__ import annotations
 
 import json
-import threading
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from fastapi import APIRouter, Response
-from prometheus_client import CollectorRegistry, Histogram, disable_created_metrics
-from prometheus_client import Counter as PlainCounter
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Histogram,
+    Summary,
+    disable_created_metrics,
+)
 from prometheus_client.core import (
     CounterMetricFamily,
     GaugeMetricFamily,
     InfoMetricFamily,
     Metric,
-    SummaryMetricFamily,
 )
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 from prometheus_client.registry import Collector
@@ -54,14 +56,17 @@ class Metrics(Collector):
     def __init__(self, snapshot: Snapshot) -> None:
         disable_created_metrics()  # text format 0.0.4 has no place for them but series of their own
         self.registry = CollectorRegistry()
-        self.answers: Counter[tuple[str, str]] = Counter()
-        """HTTP answers by method and status class."""
+        self.answers = Counter(
+            "blimp_http_answers", "HTTP answers.", ["method", "status"], registry=self.registry
+        )
         self.viewers: Callable[[], int] = lambda: 0
         self.bus_dropped: Callable[[], int] = lambda: 0
         self.video: Callable[[], Mapping[str, int]] = dict
         self._snapshot = snapshot
-        self._lock = threading.Lock()
-        self._stages: dict[tuple[str, str], tuple[int, float]] = {}
+        self._stages = Summary(
+            "blimp_stage_seconds", "Time of the localizer's stages.", ["payload", "stage"],
+            registry=self.registry,
+        )  # fmt: skip
         self._to_pose = Histogram(
             "blimp_capture_to_pose_seconds",
             "From a frame's capture to its pose, frames with a known capture time only.",
@@ -72,10 +77,10 @@ class Metrics(Collector):
             "From a frame's capture to its picture on a viewer's screen, as viewers report it.",
             ["payload"], buckets=_SECONDS, registry=self.registry,
         )  # fmt: skip
-        self.pictures_sent = PlainCounter(
+        self.pictures_sent = Counter(
             "blimp_viewer_pictures_sent", "Pictures handed to viewers.", registry=self.registry
         )
-        self.pictures_lost = PlainCounter(
+        self.pictures_lost = Counter(
             "blimp_viewer_pictures_lost",
             "Pictures that viewers who left were too slow to take.",
             registry=self.registry,
@@ -90,11 +95,8 @@ class Metrics(Collector):
             seconds = 1e-9 * (note.done_ns - note.capture_ns)
             if 0 <= seconds <= _LATENCY_LIMIT_S:  # else a clock was stepped in between
                 self._to_pose.labels(payload_id).observe(seconds)
-        with self._lock:
-            for stage, spent_ms in list(note.stage_ms.items())[:_STAGES]:
-                key = (payload_id, str(stage)[:32])
-                count, sum_s = self._stages.get(key, (0, 0.0))
-                self._stages[key] = (count + 1, sum_s + 1e-3 * spent_ms)
+        for stage, spent_ms in list(note.stage_ms.items())[:_STAGES]:
+            self._stages.labels(payload_id, stage[:32]).observe(1e-3 * spent_ms)
 
     def shown(self, payload_id: str, seconds: float) -> None:
         """A viewer saw a picture this long after its capture."""
@@ -103,10 +105,8 @@ class Metrics(Collector):
 
     def forget(self, payload_id: str) -> None:
         """A payload is forgotten; so are its series."""
-        for histogram in (self._to_pose, self._to_screen):
-            histogram.remove_by_labels({"payload": payload_id})
-        with self._lock:
-            self._stages = {key: of for key, of in self._stages.items() if key[0] != payload_id}
+        for metric in (self._to_pose, self._to_screen, self._stages):
+            metric.remove_by_labels({"payload": payload_id})
 
     def text(self) -> bytes:
         """Everything in Prometheus's text format 0.0.4."""
@@ -118,13 +118,6 @@ class Metrics(Collector):
         yield from _of_station(state)
         yield from _of_payloads(state["payloads"])
         yield from _of_processes(state["processes"])
-        stages = SummaryMetricFamily(
-            "blimp_stage_seconds", "Time of the localizer's stages.", labels=["payload", "stage"]
-        )
-        with self._lock:
-            for key, (count, sum_s) in self._stages.items():
-                stages.add_metric(key, count, sum_s)
-        yield stages
         yield GaugeMetricFamily("blimp_viewers", "Live connections.", value=self.viewers())
         yield CounterMetricFamily(
             "blimp_bus_dropped",
@@ -137,12 +130,6 @@ class Metrics(Collector):
         for fate, count in self.video().items():
             pictures.add_metric([fate], count)
         yield pictures
-        answers = CounterMetricFamily(
-            "blimp_http_answers", "HTTP answers.", labels=["method", "status"]
-        )
-        for (method, status), count in list(self.answers.items()):
-            answers.add_metric([method, status], count)
-        yield answers
 
 
 def _of_station(state: Mapping[str, Any]) -> Iterator[Metric]:

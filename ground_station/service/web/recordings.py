@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import os
 import re
 import stat
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -57,8 +57,6 @@ class Recordings:
 
     def __init__(self, folder: Path, active: Callable[[], str]) -> None:
         self._folder, self._active = folder, active
-        self._told: OrderedDict[str, tuple[tuple[int, int], _Told]] = OrderedDict()
-        self._lock = threading.Lock()
         self._exporting = threading.BoundedSemaphore(1)
 
     def list(self) -> list[dict[str, Any]]:
@@ -76,7 +74,7 @@ class Recordings:
                 "file": name,
                 "size_MB": round(status.st_size / 1e6, 3),
                 "modified_ns": status.st_mtime_ns,
-                **(_Told() if name == active else self._summary(name, status))._asdict(),
+                **(_Told() if name == active else self._told(name, status))._asdict(),
                 "active": name == active,
             }
             for status, name in found[:_FILES]
@@ -148,21 +146,13 @@ class Recordings:
         with os_errors_as(name, NotFound):
             (self._folder / name).unlink()
 
-    def _summary(self, name: str, status: os.stat_result) -> _Told:
-        identity = (status.st_size, status.st_mtime_ns)
-        with self._lock:
-            kept = self._told.get(name)
-            if kept is not None and kept[0] == identity:
-                return kept[1]
-        told = _summed_up(self._folder / name)
-        with self._lock:
-            self._told[name] = (identity, told)
-            while len(self._told) > 2 * _FILES:
-                self._told.popitem(last=False)
-        return told
+    def _told(self, name: str, status: os.stat_result) -> _Told:
+        return _summed_up(self._folder.absolute() / name, status.st_size, status.st_mtime_ns)
 
 
-def _summed_up(path: Path) -> _Told:
+@functools.lru_cache(2 * _FILES)
+def _summed_up(path: Path, _size: int, _modified_ns: int) -> _Told:
+    """What a file says that has this size and was written then: read again when it is another."""
     from pi_firmware.wire.recording import RecordingReader
 
     try:
