@@ -11,7 +11,8 @@ import pytest
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from foxglove_stand import CAPTURE_NS, PAYLOAD, estimate
+from foxglove_stand import CAPTURE_NS, estimate
+from notes import PAYLOAD
 from scipy.spatial.transform import Rotation
 
 from ground_station.geometry import poses
@@ -25,7 +26,7 @@ from ground_station.service.bus_messages import (
 from ground_station.service.foxglove import conversion, documents, drawing, world
 from ground_station.service.foxglove.neighbours import neighbours
 
-SAMPLES = 40_000
+SAMPLES = 10_000
 NEAR = 0.03  # of the deviations' product; a sample's own error is 1 / sqrt(SAMPLES) of it
 
 
@@ -110,16 +111,6 @@ def test_a_relative_pose_has_the_covariance_of_both() -> None:
     assert found.distance_sigma_m == pytest.approx(far.std(), rel=NEAR)
 
 
-def test_a_camera_that_looks_along_x_has_level_body_axes() -> None:
-    solved = conversion.solved(estimate())
-    assert solved is not None
-    assert np.allclose(solved.wTc[:3, :3], np.eye(3), atol=1e-12)
-    assert solved.position_m == [3.0, 4.0, 2.5]
-    # Camera axes z forward, x right, y down are the map's x, -y and -z here.
-    assert solved.covariance is not None
-    assert np.allclose(np.diag(solved.covariance), [3e-4, 1e-4, 2e-4, 3e-6, 1e-6, 2e-6])
-
-
 def test_the_ellipsoid_holds_19_of_20() -> None:
     R = Rotation.from_euler("zyx", [0.3, 1.0, -0.7]).as_matrix()
     covariance = R @ np.diag([0.01, 0.25, 0.04]) @ R.T
@@ -134,10 +125,6 @@ def test_a_flat_covariance_has_an_ellipsoid_that_can_be_seen() -> None:
     assert diameters.min() >= 1e-3 and np.isclose(np.linalg.norm(quaternion), 1)
 
 
-def test_a_frame_that_was_not_solved_has_no_pose() -> None:
-    assert conversion.solved(estimate(position_m=None)) is None
-
-
 def test_a_covariance_that_is_not_known_is_not_told() -> None:
     solved = conversion.solved(estimate(covariance=None))
     assert solved is not None and solved.covariance is None
@@ -150,7 +137,6 @@ def test_stamps_are_the_captures_or_the_next_best() -> None:
     assert conversion.stamp_ns(estimate(capture_ns=None)) == CAPTURE_NS + 50_000_000
     frame = FrameMessage(1, 2, 3, 4, 5, 1_000, 640, 480, 9)
     assert conversion.stamp_ns(frame) == 1_000
-    assert conversion.seconds(CAPTURE_NS) == (1_790_000_000, 123_456_789)
 
 
 @pytest.mark.parametrize(

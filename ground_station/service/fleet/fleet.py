@@ -197,7 +197,7 @@ class Fleet:
         if now_s < self._due_s.get("", 0.0):
             return
         self._due_s[""] = now_s + _TELL_S
-        away = self.where.stations_of(sorted(wants)[:WANTS])
+        away = {name: self.where.station_of(name) for name in sorted(wants)[:WANTS]}
         heard, here = self.where.heard_here()
         alone = {name for name, note in here.items() if not _follows(note)}
         overloaded = now_s - self._overloaded_s < _OVERLOADED_S

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,12 +105,6 @@ class Whereabouts:
         """The station that a payload flies with, as that one says; "" for here or nowhere."""
         with self._lock:
             return self._flown(payload_id, time.monotonic())
-
-    def stations_of(self, payloads: Iterable[str]) -> dict[str, str]:
-        """`station_of` each."""
-        now_s = time.monotonic()
-        with self._lock:
-            return {name: self._flown(name, now_s) for name in payloads}
 
     def heard_here(self) -> tuple[set[str], dict[str, PayloadMessage]]:
         """The payloads that are heard here, and of those that fly here what is told of them."""

@@ -100,8 +100,3 @@ def ellipsoid(covariance: npt.ArrayLike) -> tuple[F64, F64]:
     diameters = 2 * ELLIPSOID_SIGMAS * np.sqrt(np.maximum(variances, 0.0))
     turned = poses.to_quaternion(poses.pose(axes, [0, 0, 0]))
     return np.maximum(diameters, _LEAST_M), turned
-
-
-def seconds(time_ns: int) -> tuple[int, int]:
-    """Seconds and nanoseconds."""
-    return divmod(time_ns, 1_000_000_000)

@@ -79,7 +79,7 @@ def neighbours(payload_id: str, time_ns: int, near: Iterable[Neighbour]) -> dict
 
 
 def _header(time_ns: int, frame_id: str) -> dict[str, Any]:
-    sec, nanosec = conversion.seconds(time_ns)
+    sec, nanosec = divmod(time_ns, 1_000_000_000)
     return {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame_id}
 
 

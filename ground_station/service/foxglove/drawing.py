@@ -64,7 +64,7 @@ _LEVELS = {
 
 def stamp(time_ns: int) -> Timestamp:
     """A time as Foxglove has it."""
-    return Timestamp(*conversion.seconds(time_ns))
+    return Timestamp(*divmod(time_ns, 1_000_000_000))
 
 
 def pose_in_map(pose: Solved, time_ns: int) -> PoseInFrame:

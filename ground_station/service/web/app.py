@@ -149,9 +149,7 @@ def build(run: Run, folder: Path, bus: Bus, token: str | None, *, static: Path =
     )
     problems.install(app)
     shelf = maps.Maps(settings.map)
-    recorded = recordings.Recordings(
-        Path(settings.recording.folder), lambda: _active_file(snapshot)
-    )
+    recorded = recordings.Recordings(Path(settings.recording.folder), snapshot.recorded_now)
     app.include_router(router_of_state(snapshot, metrics))
     app.include_router(maps.router(shelf))
     app.include_router(control.router(control.Control(hub, snapshot), shelf, fleet))
@@ -180,11 +178,6 @@ def _elsewhere(fleet: Fleet | None) -> Callable[[str], Elsewhere]:
         return fleet.shelf_of(station)
 
     return shelf
-
-
-def _active_file(snapshot: Snapshot) -> str:
-    note = snapshot.recording_note()
-    return note.file if note is not None and note.active else ""
 
 
 def static_files(static: Path) -> StaticFiles:

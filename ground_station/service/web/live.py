@@ -162,23 +162,24 @@ class Live:
 
     def _alarm(self, alarm: alarms.Alarm, active: bool) -> None:
         self._send_to_viewers(said("alarm", active=active, alarm=vars(alarm)))
-        level, word = (alarm.level, "begins") if active else (bus_messages.INFO, "is over")
-        text = f"alarm {word}: {alarm.text}"
-        name = "alarm-begins" if active else "alarm-over"
-        with contextlib.suppress(Exception):  # the bus may be what fails
-            self._publish_event(
-                alarm.payload, EventMessage(time.time_ns(), "web", level, name, text)
-            )
+        if active:
+            self._say(alarm.payload, alarm.level, "alarm-begins", f"alarm begins: {alarm.text}")
+        else:
+            text = f"alarm is over: {alarm.text}"
+            self._say(alarm.payload, bus_messages.INFO, "alarm-over", text)
 
     def _follow_job(self, job: dict[str, Any] | None) -> None:
         runs = bool(job and job["running"])
         if job and self._job_ran and not runs:
             level = bus_messages.INFO if job["status"] == 0 else bus_messages.WARNING
             text = f"{job['command']}: {job['line'] or 'ended'}"
-            with contextlib.suppress(Exception):  # the bus may be what fails
-                note = EventMessage(time.time_ns(), "web", level, "job-ended", text)
-                self._publish_event(bus_messages.STATION, note)
+            self._say(bus_messages.STATION, level, "job-ended", text)
         self._job_ran = runs
+
+    def _say(self, payload_id: str, level: bus_messages.Level, name: str, text: str) -> None:
+        with contextlib.suppress(Exception):  # the bus may be what fails
+            note = EventMessage(time.time_ns(), "web", level, name, text)
+            self._publish_event(payload_id, note)
 
     def _send_to_viewers(self, text: str) -> None:
         for viewer in self._viewers:

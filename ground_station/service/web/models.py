@@ -12,7 +12,13 @@ from fastapi import Path
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StringConstraints
 
 from ground_station.service.alarms import Alarm
-from ground_station.service.bus_messages import EstimateMessage, PayloadMessage, RecordingMessage
+from ground_station.service.bus_messages import (
+    EstimateMessage,
+    EventMessage,
+    PayloadMessage,
+    ProcessMessage,
+    RecordingMessage,
+)
 from ground_station.service.settings import MAP_NAME
 
 PAYLOAD_PATTERN = "^[a-z0-9][a-z0-9_-]{0,31}$"
@@ -146,15 +152,10 @@ class StationModel(BaseModel):
     apart_m: float
 
 
-class ProcessModel(BaseModel):
+@dataclass(frozen=True, kw_only=True)
+class ProcessModel(ProcessMessage):
     """A process of the service; `age_s` since it last said that it lives."""
 
-    name: str
-    pid: int
-    memory_MB: float
-    cpu: float
-    uptime_s: float
-    restarts: int
     age_s: float
     restarted_s: float | None
 
@@ -177,14 +178,10 @@ class PayloadModel(BaseModel):
     trail_breaks: list[int] = []
 
 
-class EventModel(BaseModel):
-    """Something that happened."""
+@dataclass(frozen=True)
+class EventModel(EventMessage):
+    """Something that happened, and to whom; "-" is the station itself."""
 
-    time_ns: int
-    source: str
-    level: str
-    name: str
-    text: str
     payload: str
 
 

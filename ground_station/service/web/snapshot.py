@@ -252,10 +252,10 @@ class Snapshot:
         with self._lock:
             return list(self._events)[-EVENTS_SHOWN:]
 
-    def recording_note(self) -> RecordingMessage | None:
-        """The newest word on the recording."""
+    def recorded_now(self) -> str:
+        """The file that is being written; "" for none."""
         with self._lock:
-            return self._recording
+            return self._recording.file if self._recording and self._recording.active else ""
 
     def document(self, *, full: bool = True) -> dict[str, Any]:
         """The whole state as plain JSON values; short of trails, points and events if not full."""

@@ -22,10 +22,8 @@ class Trail:
         self._points: list[tuple[int, list[float], bool]] = []
 
     def add(self, now_ns: int, position_m: Sequence[float], begins: bool = False) -> None:
-        """Takes a position (3,), m; one that is not finite or near the last one is left out."""
-        point = [round(float(value), 3) for value in position_m[:3]]
-        if len(point) != 3 or not all(map(math.isfinite, point)):
-            return
+        """Takes a position (3,), m; one near the last one is left out."""
+        point = [round(value, 3) for value in position_m]
         if self._points:
             last_ns, last, broke = self._points[-1]
             begins = begins or now_ns - last_ns > _GAP_NS
