@@ -22,6 +22,15 @@ PAYLOAD = "blimp-1"
 WIDTH, HEIGHT = 64, 48
 
 
+class Clock:
+    """A monotonic clock that a test sets."""
+
+    ns = 1000 * 10**9
+
+    def __call__(self) -> int:
+        return self.ns
+
+
 @dataclass
 class SilentBus:
     """A bus on which `put` says what others would, and `query` gives the answer that was set."""

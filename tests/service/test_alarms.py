@@ -8,19 +8,12 @@ from typing import Any
 
 import pytest
 import web_station as station
+from notes import Clock
 
 from ground_station.service import alarms, bus_messages
 from ground_station.service.web.snapshot import Snapshot
 
 S = 1_000_000_000
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.ns = 1000 * S
-
-    def __call__(self) -> int:
-        return self.ns
 
 
 @pytest.fixture

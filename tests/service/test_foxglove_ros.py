@@ -62,13 +62,13 @@ class Ros:
 
 
 @pytest.fixture
-def station(tmp_path: Path) -> Iterator[SimpleNamespace]:
-    with Station(tmp_path) as said, server(tmp_path) as (process, port):
-        yield SimpleNamespace(said=said, process=process, port=port)
+def station(tmp_path: Path) -> Iterator[Station]:
+    with Station(tmp_path) as said, server(tmp_path) as (said.process, said.port):
+        yield said
 
 
 def test_it_publishes_poses_with_their_covariance_and_waits_for_a_station_that_is_gone(
-    station: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+    station: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     url = f"ws://127.0.0.1:{station.port}"
     ros = Ros(topic=f"/{PAYLOAD}/estimate", url=url)
@@ -79,18 +79,18 @@ def test_it_publishes_poses_with_their_covariance_and_waits_for_a_station_that_i
     monkeypatch.setattr(bridge, "_PAUSE_S", 0.05)
     thread = threading.Thread(target=bridge.main, daemon=True)
     thread.start()
-    eventually(lambda: ros.published, step=lambda: station.said.say(estimate()))
+    eventually(lambda: ros.published, step=lambda: station.say(estimate()))
     topic, message = ros.published[0]
     assert topic == "pose" and message.header["frame_id"] == "map"
     assert message.pose["pose"]["position"] == {"x": 3.0, "y": 4.0, "z": 2.5}
     assert len(message.pose["covariance"]) == 36
     for _ in range(3):
-        station.said.say(estimate(position_m=None, quaternion_xyzw=None, covariance=None))
+        station.say(estimate(position_m=None, quaternion_xyzw=None, covariance=None))
 
     def there() -> bool:
         return ros.published[-1][1].pose["pose"]["position"]["x"] == 9.0
 
-    eventually(there, step=lambda: station.said.say(estimate(position_m=[9.0, 4.0, 2.5])))
+    eventually(there, step=lambda: station.say(estimate(position_m=[9.0, 4.0, 2.5])))
     assert all(len(message.pose["covariance"]) == 36 for _, message in ros.published)
     station.process.terminate()
     eventually(lambda: len(ros.warnings) >= 2)

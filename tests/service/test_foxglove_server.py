@@ -11,7 +11,6 @@ import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -62,12 +61,12 @@ SCHEMAS = {
 
 
 @pytest.fixture(scope="module")
-def stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SimpleNamespace]:
+def stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Station]:
     """One process for all tests that leave it as it was."""
     folder = tmp_path_factory.mktemp("run")
-    with Station(folder) as station, server(folder) as (process, port):
-        yield SimpleNamespace(station=station, process=process, port=port)
-        assert process.poll() is None
+    with Station(folder) as stand, server(folder) as (stand.process, stand.port):
+        yield stand
+        assert stand.process.poll() is None
 
 
 def close(a: Any, *b: float) -> bool:
@@ -75,20 +74,20 @@ def close(a: Any, *b: float) -> bool:
     return np.allclose([getattr(a, name) for name in "xyzw"[: len(b)]], b, atol=1e-9)
 
 
-def test_every_topic_has_its_schema(stand: SimpleNamespace) -> None:
+def test_every_topic_has_its_schema(stand: Station) -> None:
     with Client(stand.port) as client:
         client.until(
             lambda: SCHEMAS.keys() <= client.channels.keys(),
             "topics",
-            again=lambda: stand.station.say(estimate()),
+            again=lambda: stand.say(estimate()),
         )
         assert {name: client.channels[name]["schemaName"] for name in SCHEMAS} == SCHEMAS
         # Nothing can be asked of it but to be told.
         assert client.info["capabilities"] == []
 
 
-def test_a_pose_goes_out_in_ros_frames(stand: SimpleNamespace) -> None:
-    say = lambda: stand.station.say(estimate())  # noqa: E731
+def test_a_pose_goes_out_in_ros_frames(stand: Station) -> None:
+    say = lambda: stand.say(estimate())  # noqa: E731
     say()
     with Client(stand.port) as client:
         client.subscribe("/tf", f"/{PAYLOAD}/pose", f"/{PAYLOAD}/estimate")
@@ -117,9 +116,7 @@ def test_a_pose_goes_out_in_ros_frames(stand: SimpleNamespace) -> None:
         assert (said["state"], said["inliers"], said["sequence"]) == ("TRACKING", 40, 7)
 
 
-def test_the_others_are_seen_from_each_whichever_station_they_fly_with(
-    stand: SimpleNamespace,
-) -> None:
+def test_the_others_are_seen_from_each_whichever_station_they_fly_with(stand: Station) -> None:
     # Two metres to the left of the first, and half a second later two and a half.
     other = estimate(
         position_m=[3.0, 6.0, 2.5], capture_ns=CAPTURE_NS - 500_000_000,
@@ -128,14 +125,14 @@ def test_the_others_are_seen_from_each_whichever_station_they_fly_with(
     elsewhere = dataclasses.replace(other, position_m=[5.0, 4.0, 2.5])
     lost = dataclasses.replace(other, state="LOST")
     foreign = dataclasses.replace(other, map="hall")
-    bus = stand.station.bus
+    bus = stand.bus
 
     def say() -> None:
-        stand.station.say(other, "blimp-2")
-        stand.station.say(lost, "blimp-3")
-        stand.station.say(foreign, "blimp-4")
+        stand.say(other, "blimp-2")
+        stand.say(lost, "blimp-3")
+        stand.say(foreign, "blimp-4")
         bus.publish(bus_messages.ELSEWHERE, "blimp-5", elsewhere)
-        stand.station.say(estimate())
+        stand.say(estimate())
 
     say()
     with Client(stand.port) as client:
@@ -156,21 +153,21 @@ def test_the_others_are_seen_from_each_whichever_station_they_fly_with(
         assert left["distance_sigma_m"] == pytest.approx(math.sqrt(2 * 1e-4), rel=1e-6)
 
 
-def test_a_frame_that_was_not_solved_has_no_pose(stand: SimpleNamespace) -> None:
+def test_a_frame_that_was_not_solved_has_no_pose(stand: Station) -> None:
     lost = estimate(9, state="LOST", reason="too few", position_m=None, quaternion_xyzw=None)
-    stand.station.say(estimate())
+    stand.say(estimate())
     with Client(stand.port) as client:
         client.subscribe(f"/{PAYLOAD}/pose", f"/{PAYLOAD}/estimate", f"/{PAYLOAD}/scene")
         got = client.received[f"/{PAYLOAD}/estimate"]
         client.until(
             lambda: bool(got) and got[-1][1]["sequence"] == 9,
             "the lost one",
-            lambda: stand.station.say(lost),
+            lambda: stand.say(lost),
         )
         _, said = got[-1]
         assert said["pose"] is None and (said["state"], said["reason"]) == ("LOST", "too few")
         poses = len(client.received[f"/{PAYLOAD}/pose"])
-        stand.station.say(lost)
+        stand.say(lost)
         client.drain()
         assert got[-1][1]["pose"] is None and len(client.received[f"/{PAYLOAD}/pose"]) == poses
         # The marker stays where it was last and says so; nothing claims to know how well.
@@ -178,20 +175,20 @@ def test_a_frame_that_was_not_solved_has_no_pose(stand: SimpleNamespace) -> None
         client.until(
             lambda: any("LOST" in e.texts[0].text for _, s in scene for e in s.entities if e.texts),
             "marker",
-            lambda: stand.station.say(lost),
+            lambda: stand.say(lost),
         )
         assert "ellipsoid" in [deletion.id for deletion in scene[-1][1].deletions]
 
 
-def test_the_scene_has_marker_ellipsoid_and_trail(stand: SimpleNamespace) -> None:
+def test_the_scene_has_marker_ellipsoid_and_trail(stand: Station) -> None:
     with Client(stand.port) as client:
-        stand.station.say(estimate())
+        stand.say(estimate())
         client.subscribe(f"/{PAYLOAD}/scene")
         found: dict[str, Any] = {}
         x = iter(range(1000))
 
         def fly() -> None:
-            stand.station.say(estimate(position_m=[3.0 + 0.1 * next(x), 4.0, 2.5]))
+            stand.say(estimate(position_m=[3.0 + 0.1 * next(x), 4.0, 2.5]))
 
         def complete() -> bool:
             for _, scene in client.received[f"/{PAYLOAD}/scene"]:
@@ -218,45 +215,42 @@ def test_the_scene_has_marker_ellipsoid_and_trail(stand: SimpleNamespace) -> Non
                 }
             ),
             "deletion",
-            lambda: stand.station.bus.publish(bus_messages.PAYLOAD, PAYLOAD, gone),
+            lambda: stand.bus.publish(bus_messages.PAYLOAD, PAYLOAD, gone),
         )
 
 
-def test_pictures_are_the_rings_with_their_capture_time_and_points(stand: SimpleNamespace) -> None:
-    stand.station.say(estimate())
+def test_pictures_are_the_rings_with_their_capture_time_and_points(stand: Station) -> None:
+    stand.say(estimate())
     sequence = iter(range(10_000))
     with Client(stand.port) as client:
         client.subscribe(f"/{PAYLOAD}/camera/image", f"/{PAYLOAD}/camera/points")
         log_ns, image = client.first(
-            f"/{PAYLOAD}/camera/image", lambda: stand.station.show(RAMP, next(sequence))
+            f"/{PAYLOAD}/camera/image", lambda: stand.show(RAMP, next(sequence))
         )
         assert log_ns == CAPTURE_NS == image.timestamp.ToNanoseconds()
         assert (image.frame_id, image.format) == (f"{PAYLOAD}/camera_optical", "jpeg")
         decoded = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_GRAYSCALE)
         assert decoded is not None and decoded.shape == RAMP.shape
         assert np.abs(decoded.astype(int) - RAMP).mean() < 2
-        _, points = client.first(f"/{PAYLOAD}/camera/points", lambda: stand.station.say(estimate()))
+        _, points = client.first(f"/{PAYLOAD}/camera/points", lambda: stand.say(estimate()))
         assert [(p.x, p.y) for p in points.points[0].points] == [(10.0, 20.0), (30.5, 40.5)]
 
 
-def test_pictures_come_no_faster_than_the_dashboards(stand: SimpleNamespace) -> None:
-    stand.station.say(estimate())
+def test_pictures_come_no_faster_than_the_dashboards(stand: Station) -> None:
+    stand.say(estimate())
     with Client(stand.port) as client:
         client.subscribe(f"/{PAYLOAD}/camera/image")
         begin_s, sequence = time.monotonic(), 0
         while time.monotonic() - begin_s < 1.5:
             sequence += 1
-            stand.station.show(RAMP, sequence)
+            stand.show(RAMP, sequence)
             client.receive(0.005)
         count = len(client.received[f"/{PAYLOAD}/camera/image"])
         # 15 Hz of about 150; the first may come at once and each a quarter of a period early.
         assert 1 <= count <= 15 * (time.monotonic() - begin_s) + 2 < sequence
 
 
-def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(
-    stand: SimpleNamespace,
-) -> None:
-    station = stand.station
+def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(stand: Station) -> None:
     battery = messages.Battery(5, 3.9)
     health = messages.Health(6, uptime_s=3.0)
     note = PayloadMessage(True, 1, battery=battery, health=health, rate_hz=30.0)
@@ -271,16 +265,16 @@ def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(
         first.until(
             lambda: f"/{PAYLOAD}/scene" in first.channels,
             "payload",
-            lambda: station.say(estimate()),
+            lambda: stand.say(estimate()),
         )
         first.subscribe(*kept)
 
         def say() -> None:
-            station.bus.publish(bus_messages.PAYLOAD, PAYLOAD, note)
-            station.bus.publish(bus_messages.EVENT, PAYLOAD, event)
-            station.bus.publish(bus_messages.RECORDING, bus_messages.STATION, recording)
-            station.show(RAMP, 1)
-            station.say(estimate())
+            stand.bus.publish(bus_messages.PAYLOAD, PAYLOAD, note)
+            stand.bus.publish(bus_messages.EVENT, PAYLOAD, event)
+            stand.bus.publish(bus_messages.RECORDING, bus_messages.STATION, recording)
+            stand.show(RAMP, 1)
+            stand.say(estimate())
 
         first.until(lambda: all(first.received[topic] for topic in kept), "all", say)
         first.drain()
@@ -314,9 +308,9 @@ def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(
     assert {tuple(point) for point in points.tolist()} <= {tuple(p) for p in truth.tolist()}
 
 
-def test_notes_that_cannot_be_end_nothing(stand: SimpleNamespace) -> None:
+def test_notes_that_cannot_be_end_nothing(stand: Station) -> None:
     with Client(stand.port) as client:
-        stand.station.say(estimate())
+        stand.say(estimate())
         client.subscribe(f"/{PAYLOAD}/estimate", f"/{PAYLOAD}/scene", "/events", "/log")
         hostile: list[Any] = [
             estimate(1, state=[1], reason=5, map={"a": 1}),
@@ -325,8 +319,8 @@ def test_notes_that_cannot_be_end_nothing(stand: SimpleNamespace) -> None:
             estimate(4, points_px=[1.0, float("nan"), 2.0]),
         ]
         for note in hostile:
-            stand.station.say(note)
-        bus = stand.station.bus
+            stand.say(note)
+        bus = stand.bus
         bus.publish(bus_messages.EVENT, PAYLOAD, EventMessage("x", 1, [2], None, {}))  # type: ignore[arg-type]
         bus.publish(bus_messages.PAYLOAD, PAYLOAD, PayloadMessage("x", [], battery=3, health=[]))  # type: ignore[arg-type]
         bus.publish(bus_messages.FRAME, PAYLOAD, FrameMessage(-1, "a", None, 0, 0, 0, 640, 480, 0))  # type: ignore[arg-type]
@@ -336,7 +330,7 @@ def test_notes_that_cannot_be_end_nothing(stand: SimpleNamespace) -> None:
                 said["sequence"] == 77 for _, said in client.received[f"/{PAYLOAD}/estimate"]
             ),
             "the next",
-            lambda: stand.station.say(estimate(77)),
+            lambda: stand.say(estimate(77)),
         )
         bus.publish(
             bus_messages.EVENT, PAYLOAD, EventMessage(CAPTURE_NS, "web", "info", "next", "one")
@@ -351,37 +345,37 @@ def test_notes_that_cannot_be_end_nothing(stand: SimpleNamespace) -> None:
         assert not any("No Payload" in topic for topic in client.channels)
 
 
-def test_a_client_that_does_not_read_delays_nobody(stand: SimpleNamespace) -> None:
-    stand.station.say(estimate())
+def test_a_client_that_does_not_read_delays_nobody(stand: Station) -> None:
+    stand.say(estimate())
     topics = tuple(topic for topic in SCHEMAS if topic.startswith(f"/{PAYLOAD}/"))
     with Client(stand.port) as slow, Client(stand.port) as quick:
         slow.subscribe(*topics)
         quick.subscribe(f"/{PAYLOAD}/estimate")
         long = "x" * 100_000  # more than sockets and the slow client's queue can hold
         for sequence in range(100, 500):
-            stand.station.say(estimate(sequence, reason=long))
+            stand.say(estimate(sequence, reason=long))
             quick.receive(0.0)
         got = quick.received[f"/{PAYLOAD}/estimate"]
         quick.until(
             lambda: bool(got) and got[-1][1]["sequence"] == 2000,
             "the newest",
-            lambda: stand.station.say(estimate(2000)),
+            lambda: stand.say(estimate(2000)),
         )
-        beats = len(stand.station.beats)
-        eventually(lambda: len(stand.station.beats) > beats, what="beat")
+        beats = len(stand.beats)
+        eventually(lambda: len(stand.beats) > beats, what="beat")
         # It did lose some, and not the newest.
         slow.drain()
         numbers = [said["sequence"] for _, said in slow.received[f"/{PAYLOAD}/estimate"]]
         assert numbers[-1] == 2000 and len(set(numbers)) < 401 and numbers == sorted(numbers)
 
 
-def test_it_says_that_it_lives(stand: SimpleNamespace) -> None:
-    eventually(lambda: bool(stand.station.beats), what="beat")
-    beat = stand.station.beats[-1]
+def test_it_says_that_it_lives(stand: Station) -> None:
+    eventually(lambda: bool(stand.beats), what="beat")
+    beat = stand.beats[-1]
     assert (beat.name, beat.pid) == ("foxglove", stand.process.pid)
 
 
-def test_another_protocol_is_refused(stand: SimpleNamespace) -> None:
+def test_another_protocol_is_refused(stand: Station) -> None:
     url, other = f"ws://127.0.0.1:{stand.port}", Subprotocol("chat")
     with pytest.raises(InvalidStatus), connect(url, subprotocols=[other]):
         pass

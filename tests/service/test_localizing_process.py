@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import signal
 import subprocess
@@ -61,25 +62,20 @@ def shelf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def kept(
-    tmp_path_factory: pytest.TempPathFactory, shelf: Path
-) -> Iterator[tuple[Station, subprocess.Popen[str]]]:
+def kept(tmp_path_factory: pytest.TempPathFactory, shelf: Path) -> Iterator[Station]:
     """One localizer that has loaded its map, for all tests that leave it as it was."""
     folder = tmp_path_factory.mktemp("run")
-    with Station(folder, shelf=str(shelf)) as told, localizer(folder) as process:
+    with Station(folder, shelf=str(shelf)) as told, localizer(folder) as told.process:
         eventually(lambda: told.event("map-loaded") is not None, what="the map")
-        yield told, process
+        yield told
 
 
 @pytest.fixture
-def running(
-    kept: tuple[Station, subprocess.Popen[str]],
-) -> tuple[Station, subprocess.Popen[str]]:
-    """The localizer at the beginning of a session."""
-    told, process = kept
-    assert process.poll() is None
-    told.anew()
-    return kept
+def told(kept: Station) -> Iterator[Station]:
+    """What the localizer says from the beginning of a session; it lives through the test."""
+    kept.anew()
+    yield kept
+    assert kept.process.poll() is None
 
 
 def error_m(note: EstimateMessage) -> float:
@@ -99,16 +95,15 @@ def localized(told: Station, frame: Frame, **fields: Any) -> EstimateMessage:
 
 
 def test_the_sample_flight_is_localized_and_every_frame_accounted_for(
-    running: tuple[Station, subprocess.Popen[str]], tmp_path: Path
+    told: Station, tmp_path: Path
 ) -> None:
     """4 s of the real firmware's video at 30 Hz, however slow the machine."""
-    told, process = running
     with Intake(told) as intake:
         with FirmwareProcess(payload(intake.receiver.port), tmp_path) as firmware:
             eventually(lambda: not firmware.running(), what="the stream's end")
             firmware.check()
         eventually(told.accounted, what="the last frame")
-        assert process.poll() is None
+        assert told.process.poll() is None
         assert told.said == intake.receiver.counters.decoded > 60
         last = told.estimates[-1]
         assert last.processed == len(told.estimates)
@@ -124,13 +119,12 @@ def test_the_sample_flight_is_localized_and_every_frame_accounted_for(
             assert note.capture_ns is not None and note.capture_ns < note.done_ns
         found = [note for note in told.estimates if note.position_m]
         assert all(20 <= len(note.points_px) <= 600 for note in found)
-        assert told.beats and told.beats[-1].pid == process.pid
+        assert told.beats and told.beats[-1].pid == told.process.pid
 
 
 def test_velocity_and_covariance_are_those_of_the_flight(
-    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+    told: Station, flight: list[Frame]
 ) -> None:
-    told, _ = running
     said = [localized(told, frame) for frame in flight[:20]]
     last = said[-1]
     assert any(note.state == "TRACKING" for note in said)
@@ -146,11 +140,8 @@ def test_velocity_and_covariance_are_those_of_the_flight(
     assert np.trace(sigma) == pytest.approx(np.trace(own))
 
 
-def test_another_stream_begins_anew(
-    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
-) -> None:
+def test_another_stream_begins_anew(told: Station, flight: list[Frame]) -> None:
     """A payload that was restarted has another SSRC; a replay that begins again goes back."""
-    told, _ = running
     for frame in flight[10:13]:
         localized(told, frame)
     for at, ssrc in ((flight[0], told.ssrc), (flight[25], told.ssrc + 1)):
@@ -159,10 +150,7 @@ def test_another_stream_begins_anew(
         assert not localized(told, flight[26], ssrc=ssrc).relocalized
 
 
-def test_relocalize_forgets_the_pose_and_searches(
-    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
-) -> None:
-    told, _ = running
+def test_relocalize_forgets_the_pose_and_searches(told: Station, flight: list[Frame]) -> None:
     said = [localized(told, frame) for frame in flight[:5]]
     assert [note.relocalized for note in said] == [True, False, False, False, False]
     assert told.bus.query(NAME, {"do": "relocalize"}) == {"done": True, "reason": ""}
@@ -170,10 +158,7 @@ def test_relocalize_forgets_the_pose_and_searches(
     assert not localized(told, flight[6]).relocalized
 
 
-def test_a_map_is_changed_while_frames_come(
-    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
-) -> None:
-    told, _ = running
+def test_a_map_is_changed_while_frames_come(told: Station, flight: list[Frame]) -> None:
     before = localized(told, flight[0])
     assert before.map == "atrium"
     answer = told.bus.query(NAME, {"do": "map", "name": "hall"}, timeout_s=LIMIT_S)
@@ -200,22 +185,18 @@ def test_a_map_is_changed_while_frames_come(
     ],
 )
 def test_a_map_that_is_refused_leaves_the_old_one_in_use(
-    name: Any, reason: str, running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+    name: Any, reason: str, told: Station, flight: list[Frame]
 ) -> None:
-    told, process = running
     localized(told, flight[0])
     answer = told.bus.query(NAME, {"do": "map", "name": name}, timeout_s=LIMIT_S)
     assert not answer["done"] and reason in answer["reason"] and "\n" not in answer["reason"]
     kept = localized(told, flight[1])
     assert kept.map == "atrium" and kept.position_m and not kept.relocalized
-    assert process.poll() is None
 
 
-def test_a_question_that_is_not_known_is_refused(
-    running: tuple[Station, subprocess.Popen[str]],
-) -> None:
+def test_a_question_that_is_not_known_is_refused(told: Station) -> None:
     for request in ({}, {"do": "dance"}, {"do": ["map"]}):
-        answer = running[0].bus.query(NAME, request)
+        answer = told.bus.query(NAME, request)
         assert not answer["done"] and "is not known (known: relocalize, map)" in answer["reason"]
 
 
@@ -244,9 +225,8 @@ def test_without_a_map_it_stays_says_so_and_takes_another(
 
 
 def test_what_is_no_message_is_dropped_and_a_picture_that_is_not_there_is_counted(
-    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+    told: Station, flight: list[Frame]
 ) -> None:
-    told, process = running
     localized(told, flight[0])
     frame, session = flight[1], told.bus._session
     key = f"station/frame/{PAYLOAD}"
@@ -267,13 +247,11 @@ def test_what_is_no_message_is_dropped_and_a_picture_that_is_not_there_is_counte
     found = localized(told, flight[21])
     assert found.relocalized and error_m(found) < 0.1
     assert found.processed == 3 and found.skipped == len(gone)
-    assert process.poll() is None
 
 
 def test_frames_of_another_cameras_size_are_refused_and_it_lives(
-    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
+    told: Station, flight: list[Frame]
 ) -> None:
-    told, process = running
     small = np.ascontiguousarray(flight[0].image[::2, ::2])
     for k in range(12):  # more than may fail
         before = len(told.estimates)
@@ -283,13 +261,10 @@ def test_frames_of_another_cameras_size_are_refused_and_it_lives(
         assert said.state == "INITIALIZING" and said.position_m is None
         assert said.reason.startswith(f"frame {k} has 320x240 pixels, the camera 640x480: ")
     assert sum(event.name == "frame-refused" for event in told.events) == 1
-    assert localized(told, flight[1]).position_m and process.poll() is None
+    assert localized(told, flight[1]).position_m
 
 
-def test_a_picture_that_was_overwritten_is_skipped(
-    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
-) -> None:
-    told, _ = running
+def test_a_picture_that_was_overwritten_is_skipped(told: Station, flight: list[Frame]) -> None:
     localized(told, flight[0])
     old = told.show(flight[1].image, 1, flight[1].time_ns)
     eventually(lambda: len(told.estimates) == 2)
@@ -301,11 +276,8 @@ def test_a_picture_that_was_overwritten_is_skipped(
     assert told.event("frame-refused") is None
 
 
-def test_an_intake_that_comes_back_is_heard_again(
-    running: tuple[Station, subprocess.Popen[str]], flight: list[Frame]
-) -> None:
+def test_an_intake_that_comes_back_is_heard_again(told: Station, flight: list[Frame]) -> None:
     """It makes its ring again."""
-    told, _ = running
     localized(told, flight[0])
     told.pictures.close()
     told.pictures = type(told.pictures)(told.folder, PAYLOAD)
@@ -341,35 +313,42 @@ def test_bad_input_is_one_line_and_status_2(
         assert said.startswith("localizer x: ") and said.count("\n") == 1
 
 
+@contextlib.contextmanager
+def in_a_thread(told: Station) -> Iterator[list[int]]:
+    """The process's loop in this one, until the block ends; the status that it gave, then."""
+    stop, ended = threading.Event(), list[int]()
+    with Bus(told.folder, NAME) as bus:
+        localizing = Localizing(bus, told.folder, PAYLOAD, told.run)
+        thread = threading.Thread(target=lambda: ended.append(localizing.run(stop)))
+        thread.start()
+        try:
+            yield ended
+        finally:
+            stop.set()
+            thread.join()
+
+
 def test_while_its_map_is_loaded_it_says_so(
     tmp_path: Path, flight: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """That is no alarm, and no frame is without account."""
-    release, real, stop = threading.Event(), maps.prepare, threading.Event()
+    release, real = threading.Event(), maps.prepare
 
     def slow(*arguments: Any) -> Localizer:
         release.wait(LIMIT_S)
         return real(*arguments)
 
     monkeypatch.setattr(maps, "prepare", slow)
-    with Station(tmp_path) as told, Bus(tmp_path, NAME) as bus:
-        localizing = Localizing(bus, tmp_path, PAYLOAD, told.run)
-        thread = threading.Thread(target=localizing.run, args=(stop,))
-        thread.start()
-        try:
-            ask = functools.partial(told.bus.query, NAME, {"do": "map", "name": "atrium"})
-            # Answered, it also hears of frames: it subscribes first.
-            loading = "the map 'atrium' is being loaded; try again then"
-            eventually(lambda: ask()["reason"] == loading)
-            said = localized(told, flight[0])
-            assert (said.state, said.reason) == ("INITIALIZING", "the map is being loaded")
-            release.set()
-            eventually(lambda: told.event("map-loaded") is not None, what="the map")
-            assert error_m(localized(told, flight[1])) < 0.1
-        finally:
-            release.set()
-            stop.set()
-            thread.join()
+    with Station(tmp_path) as told, in_a_thread(told):
+        ask = functools.partial(told.bus.query, NAME, {"do": "map", "name": "atrium"})
+        # Answered, it also hears of frames: it subscribes first.
+        loading = "the map 'atrium' is being loaded; try again then"
+        eventually(lambda: ask()["reason"] == loading)
+        said = localized(told, flight[0])
+        assert (said.state, said.reason) == ("INITIALIZING", "the map is being loaded")
+        release.set()
+        eventually(lambda: told.event("map-loaded") is not None, what="the map")
+        assert error_m(localized(told, flight[1])) < 0.1
 
 
 class _Failing:
@@ -398,32 +377,22 @@ def test_failures_are_counted_and_ten_in_a_row_end_it(
     times: int, tmp_path: Path, flight: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failing = _Failing(monkeypatch, times)
-    ended: list[int] = []
-    stop = threading.Event()
-    with Station(tmp_path) as told, Bus(tmp_path, NAME) as bus:
-        localizing = Localizing(bus, tmp_path, PAYLOAD, told.run)
-        thread = threading.Thread(target=lambda: ended.append(localizing.run(stop)))
-        thread.start()
-        try:
-            eventually(lambda: told.event("map-loaded") is not None, what="the map")
-            failing.resets = 0
-            for frame in flight[:times]:
-                said = localized(told, frame)
-                assert said.state == "INITIALIZING" and said.position_m is None
-                assert said.reason == "RuntimeError: made up"
-            assert failing.resets == 1
-            failed = [event for event in told.events if event.name == "frame-failed"]
-            assert len(failed) == 1 and "RuntimeError: made up" in failed[0].text
-            if times == 9:
-                assert error_m(localized(told, flight[20])) < 0.1
-                assert told.estimates[-1].processed == 10
-            else:
-                eventually(lambda: bool(ended), what="the end")
-                assert ended == [RESTART]
-                eventually(lambda: told.event("localizer-failed") is not None, what="the event")
-        finally:
-            stop.set()
-            thread.join()
+    with Station(tmp_path) as told, in_a_thread(told) as ended:
+        eventually(lambda: told.event("map-loaded") is not None, what="the map")
+        failing.resets = 0
+        for frame in flight[:times]:
+            said = localized(told, frame)
+            assert said.state == "INITIALIZING" and said.position_m is None
+            assert said.reason == "RuntimeError: made up"
+        assert failing.resets == 1
+        failed = [event for event in told.events if event.name == "frame-failed"]
+        assert len(failed) == 1 and "RuntimeError: made up" in failed[0].text
+        if times == 9:
+            assert error_m(localized(told, flight[20])) < 0.1
+            assert told.estimates[-1].processed == 10
+        else:
+            eventually(lambda: bool(ended), what="the end")
+            eventually(lambda: told.event("localizer-failed") is not None, what="the event")
     assert ended == ([RESTART] if times == 10 else [0])
 
 

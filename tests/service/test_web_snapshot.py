@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 import web_station as station
+from notes import Clock
 
 from ground_station.service import settings
 from ground_station.service.web import trail
@@ -15,13 +16,6 @@ from ground_station.service.web.snapshot import EVENTS, EVENTS_SHOWN, PAYLOADS, 
 
 S = 1_000_000_000
 P = station.PAYLOAD
-
-
-class Clock:
-    ns = 1000 * S
-
-    def __call__(self) -> int:
-        return self.ns
 
 
 @pytest.fixture
