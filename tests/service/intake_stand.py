@@ -114,6 +114,11 @@ class Heard:
         """One payload's frames so far."""
         return [(note, number) for who, note, number in list(self.frames) if who == payload_id]
 
+    def more(self, count: int, *payload_ids: str) -> None:
+        """Waits until more than so many further frames of each have come."""
+        seen = {name: len(self.of(name)) for name in payload_ids}
+        eventually(lambda: all(len(self.of(name)) > seen[name] + count for name in seen))
+
     def event_names(self, payload_id: str) -> list[str]:
         """The names of one payload's events so far."""
         return [note.name for who, note in list(self.events) if who == payload_id]

@@ -22,17 +22,14 @@ def test_two_payloads_with_their_keys_and_nobody_else(tmp_path: Path) -> None:
             name: stand.payload(name, f"telemetry.certificates={folder}")
             for name, folder in folders.items()
         }
-        for name in flying:
-            eventually(lambda name=name: len(stand.heard.of(name)) > 20)
+        stand.heard.more(20, *flying)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as forger:
             for datagram in stranger:
                 forger.sendto(datagram, ("127.0.0.1", stand.port))
         newer = authority.add("payload", "blimp-3")  # the station has read its list before
         stand.payload("blimp-3", f"telemetry.certificates={newer}")
         eventually(lambda: "unlisted" in stand.heard.event_names("-"))
-        at = {name: len(stand.heard.of(name)) for name in flying}
-        for name in flying:
-            eventually(lambda name=name: len(stand.heard.of(name)) > at[name] + 20)
+        stand.heard.more(20, *flying)
         for name, payload in flying.items():
             note = stand.settled(name, payload.end().counts)
             assert note.encrypted and note.clock is not None and note.battery is not None

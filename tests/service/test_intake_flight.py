@@ -41,15 +41,12 @@ def test_two_payloads_and_garbage_on_one_port(tmp_path: Path) -> None:
     with Stand(tmp_path) as stand:
         slow = "&pace=stepped&max_hz=15"
         flying = {name: stand.payload(name, query=slow) for name in ("blimp-1", "blimp-2")}
-        for name in flying:
-            eventually(lambda name=name: len(stand.heard.of(name)) > 20)
+        stand.heard.more(20, *flying)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as noise:
             for datagram in stranger:
                 noise.sendto(datagram, ("127.0.0.1", stand.port))
                 noise.sendto(draw.randbytes(draw.randint(0, 1400)), ("127.0.0.1", stand.port))
-        at = {name: len(stand.heard.of(name)) for name in flying}
-        for name in flying:
-            eventually(lambda name=name: len(stand.heard.of(name)) > at[name] + 60)
+        stand.heard.more(60, *flying)
         counts = {name: payload.end().counts for name, payload in flying.items()}
         for name, ended in counts.items():
             note = stand.settled(name, ended)
@@ -77,7 +74,7 @@ def test_lost_packets_are_accounted_for_exactly(tmp_path: Path) -> None:
         ImpairedLink(stand.port, Impairment(loss=0.02), seed=5) as link,
     ):
         payload = stand.payload("blimp-1", "link.correction=0", port=link.port)
-        eventually(lambda: len(stand.heard.of("blimp-1")) > 150)
+        stand.heard.more(150, "blimp-1")
         ended = payload.end().counts
         eventually(lambda: link.idle)
         note = stand.settled("blimp-1", ended)
@@ -99,7 +96,7 @@ def test_lost_packets_are_accounted_for_exactly(tmp_path: Path) -> None:
 def test_a_payload_that_starts_anew_is_taken_up_and_counts_from_zero(tmp_path: Path) -> None:
     with Stand(tmp_path, payloads={"most": 1}) as stand:
         first = stand.payload("blimp-1")
-        eventually(lambda: len(stand.heard.of("blimp-1")) > 20)
+        stand.heard.more(20, "blimp-1")
         first.process.kill()
         gone = eventually(
             lambda: (note := stand.heard.payload("blimp-1")) and not note.alive and note
@@ -128,18 +125,17 @@ def test_a_payload_that_starts_anew_is_taken_up_and_counts_from_zero(tmp_path: P
         assert names.count("payload-appeared") == 2 and names.count("payload-gone") >= 1
         # Its place is free for another now.
         stand.payload("blimp-2")
-        eventually(lambda: len(stand.heard.of("blimp-2")) > 5)
+        stand.heard.more(5, "blimp-2")
 
 
 def test_of_two_payloads_with_one_id_the_first_is_kept(tmp_path: Path) -> None:
     with Stand(tmp_path) as stand:
         stand.payload("blimp-1")
-        eventually(lambda: len(stand.heard.of("blimp-1")) > 20)
+        stand.heard.more(20, "blimp-1")
         ssrc = stand.heard.of("blimp-1")[0][0].ssrc
         stand.payload("blimp-1")
         eventually(lambda: "payload-twice" in stand.heard.event_names("blimp-1"))
-        seen = len(stand.heard.of("blimp-1"))
-        eventually(lambda: len(stand.heard.of("blimp-1")) > seen + 60)
+        stand.heard.more(60, "blimp-1")
         assert {note.ssrc for note, _ in stand.heard.of("blimp-1")} == {ssrc}
         all_right(stand, "blimp-1")
 
@@ -160,7 +156,7 @@ def test_hostile_telemetry_neither_ends_the_intake_nor_takes_a_place(tmp_path: P
     with Stand(tmp_path, recording={"at_start": True}) as stand:
         stranger = open_session(connect=[stand.endpoint])
         payload = stand.payload("blimp-1")
-        eventually(lambda: len(stand.heard.of("blimp-1")) > 10)
+        stand.heard.more(10, "blimp-1")
         for number in range(80):
             for kind in (keys.GATE, keys.EVENT, keys.BATTERY, keys.HEALTH, "nothing"):
                 for body in said:
@@ -168,8 +164,7 @@ def test_hostile_telemetry_neither_ends_the_intake_nor_takes_a_place(tmp_path: P
                     if number % 10 == 0 and kind != keys.EVENT and b"blimp.gate" not in body:
                         stranger.zenoh.put(f"blimp/blimp-1/{kind}", body)
         stranger.zenoh.put("blimp/../gate", said[6])
-        seen = len(stand.heard.of("blimp-1"))
-        eventually(lambda: len(stand.heard.of("blimp-1")) > seen + 60)
+        stand.heard.more(60, "blimp-1")
         stranger.close()
         ended = payload.end().counts
         note = stand.settled("blimp-1", ended)
@@ -191,7 +186,7 @@ def test_poses_reach_the_payload_and_commands_are_answered(tmp_path: Path) -> No
             lambda sample: poses.append(messages.decode(messages.Pose, sample.payload.to_bytes())),
         )
         stand.payload("blimp-1")
-        eventually(lambda: len(stand.heard.of("blimp-1")) > 5)
+        stand.heard.more(5, "blimp-1")
         bad = EstimateMessage(sequence=1, time_ns=1, clock_ns=1, done_ns=1, state="ELATED")
         said = EstimateMessage(
             sequence=7, time_ns=70, clock_ns=71, done_ns=72, state="TRACKING",

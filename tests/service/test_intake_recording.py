@@ -276,7 +276,7 @@ def test_a_disk_without_room_is_a_reason_and_an_alarm(tmp_path: Path) -> None:
 def test_sigkill_while_recording_costs_at_most_a_second(tmp_path: Path) -> None:
     with Stand(tmp_path) as stand:
         stand.payload("blimp-1")
-        eventually(lambda: len(stand.heard.of("blimp-1")) > 10)
+        stand.heard.more(10, "blimp-1")
         started = stand.ask(do="record-start")
         assert started["done"] and re.fullmatch(DATED, started["file"])
         assert stand.ask(do="record-start")["file"] == started["file"]
@@ -308,7 +308,7 @@ def test_sigterm_ends_the_recording_in_order(tmp_path: Path) -> None:
     with Stand(tmp_path, recording={"at_start": True}) as stand:
         payload = stand.payload("blimp-1")
         eventually(lambda: stand.heard.recording and stand.heard.recording[-1].active)
-        eventually(lambda: len(stand.heard.of("blimp-1")) > 60)
+        stand.heard.more(60, "blimp-1")
         note = stand.heard.recording[-1]
         assert re.fullmatch(DATED, note.file) and note.free_MB and note.problem == ""
         ended = payload.end().counts
