@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import stand
+import process_stand as stand
 from google.protobuf import descriptor_pool, message_factory
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from stand import program
+from process_stand import program
 from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 

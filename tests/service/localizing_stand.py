@@ -10,11 +10,11 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-import stand
+import process_stand as stand
 import tomli_w
-from notes import PAYLOAD
+from process_stand import SAMPLE, program
 from receiving import Receiver
-from stand import SAMPLE, program
+from station_notes import PAYLOAD
 
 from ground_station.service import bus_messages
 from ground_station.service.bus_messages import (

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import web_station as station
-from notes import Clock
+from station_notes import Clock
 
 from ground_station.service import alarms, bus_messages
 from ground_station.service.web.snapshot import Snapshot

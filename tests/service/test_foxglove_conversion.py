@@ -12,8 +12,8 @@ from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_stand import CAPTURE_NS, estimate
-from notes import PAYLOAD
 from scipy.spatial.transform import Rotation
+from station_notes import PAYLOAD
 
 from ground_station.geometry import poses
 from ground_station.service.bus_messages import (

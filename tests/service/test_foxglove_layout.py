@@ -7,7 +7,7 @@ import re
 from typing import Any
 
 import pytest
-from notes import PAYLOAD
+from station_notes import PAYLOAD
 from test_foxglove_server import SCHEMAS
 
 from ground_station.service.foxglove import documents, layout

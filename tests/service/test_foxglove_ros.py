@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 from foxglove_stand import Station, estimate, server
-from notes import PAYLOAD
-from stand import ROOT
+from process_stand import ROOT
+from station_notes import PAYLOAD
 from waiting import eventually
 
 from pi_firmware import __version__

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 from foxglove import Context
 from foxglove_stand import CAPTURE_NS, Client, Station, estimate, server
-from notes import PAYLOAD
-from stand import SAMPLE, program
+from process_stand import SAMPLE, program
+from station_notes import PAYLOAD
 from waiting import eventually
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect

@@ -25,8 +25,8 @@ from localizing_stand import (
     localizer,
     payload,
 )
-from notes import PAYLOAD
-from stand import ROOT, SAMPLE
+from process_stand import ROOT, SAMPLE
+from station_notes import PAYLOAD
 from waiting import eventually
 
 from ground_station.localization.localizer import Localizer

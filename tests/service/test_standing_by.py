@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 
 import pytest
-from notes import SilentBus
+from station_notes import SilentBus
 
 from ground_station.service import bus_messages, processes, serve
 from ground_station.service.bus_messages import PayloadMessage

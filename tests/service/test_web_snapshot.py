@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 import web_station as station
-from notes import Clock
+from station_notes import Clock
 
 from ground_station.service import settings
 from ground_station.service.web import trail

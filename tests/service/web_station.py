@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from notes import (
+from process_stand import program
+from station_notes import (
     HEIGHT,
     PAYLOAD,
     WIDTH,
@@ -26,7 +27,6 @@ from notes import (
     recording,
     say_all,
 )
-from stand import program
 from waiting import eventually
 
 from ground_station.service.pictures import PictureWriter

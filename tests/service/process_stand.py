@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import notes
+import station_notes as notes
 
 from ground_station.service import bus_messages, settings
 from ground_station.service.bus import Bus, Router
