@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
+from pathlib import Path
 
 import schemathesis
 from hypothesis import HealthCheck, given, settings
@@ -44,6 +45,8 @@ def fuzz(operation, mode, answered: Counter[str]) -> None:
 
 def test_no_request_makes_the_station_fail(unchanged):
     _, bus, web = unchanged
+    folder = Path(web.snapshot.run.station.recording.folder)
+    (folder / "a.mcap").write_bytes(b"no recording")
     schema = schemathesis.openapi.from_asgi("/api/openapi.json", web.guarded)
     answered: Counter[str] = Counter()
     operations = [found.ok() for found in schema.get_all_operations()]
