@@ -52,6 +52,10 @@ class Station(stand.Station):
     def __init__(self, folder: Path, **foxglove: Any) -> None:
         super().__init__(folder, foxglove={"port": 0, **foxglove})
 
+    def client(self) -> Client:
+        """One that is told of the payload's topics, which come with its first estimate."""
+        return Client(self.port, lambda: self.say(estimate()))
+
     def show(self, image: Any, sequence: int, **fields: Any) -> FrameMessage:
         return super().show(image, sequence, **{"capture_ns": CAPTURE_NS, **fields})
 
@@ -69,8 +73,8 @@ def server(folder: Path) -> Iterator[tuple[subprocess.Popen[str], int]]:
 class Client:
     """A client that knows nothing but the protocol: it decodes by the schemas it is told."""
 
-    def __init__(self, port: int) -> None:
-        self._stack = ExitStack()
+    def __init__(self, port: int, again: Callable[[], object] | None = None) -> None:
+        self._stack, self._again = ExitStack(), again
         self.socket = self._stack.enter_context(
             connect(
                 f"ws://127.0.0.1:{port}",
@@ -92,7 +96,8 @@ class Client:
 
     def subscribe(self, *topics: str) -> None:
         """Waits until they are told of, and subscribes."""
-        self.until(lambda: all(topic in self.channels for topic in topics), f"{topics}")
+        there = lambda: all(topic in self.channels for topic in topics)  # noqa: E731
+        self.until(there, f"{topics}", self._again)
         self.received |= {topic: [] for topic in topics}
         self._ask(topics)
 

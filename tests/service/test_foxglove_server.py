@@ -75,7 +75,7 @@ def close(a: Any, *b: float) -> bool:
 
 
 def test_every_topic_has_its_schema(stand: Station) -> None:
-    with Client(stand.port) as client:
+    with stand.client() as client:
         client.until(
             lambda: SCHEMAS.keys() <= client.channels.keys(),
             "topics",
@@ -88,8 +88,7 @@ def test_every_topic_has_its_schema(stand: Station) -> None:
 
 def test_a_pose_goes_out_in_ros_frames(stand: Station) -> None:
     say = lambda: stand.say(estimate())  # noqa: E731
-    say()
-    with Client(stand.port) as client:
+    with stand.client() as client:
         client.subscribe("/tf", f"/{PAYLOAD}/pose", f"/{PAYLOAD}/estimate")
         log_ns, pose = client.first(f"/{PAYLOAD}/pose", say)
         assert log_ns == CAPTURE_NS == pose.timestamp.ToNanoseconds()
@@ -135,7 +134,7 @@ def test_the_others_are_seen_from_each_whichever_station_they_fly_with(stand: St
         stand.say(estimate())
 
     say()
-    with Client(stand.port) as client:
+    with stand.client() as client:
         client.subscribe(f"/{PAYLOAD}/neighbours")
         topic = f"/{PAYLOAD}/neighbours"
         got = client.received[topic]
@@ -155,8 +154,7 @@ def test_the_others_are_seen_from_each_whichever_station_they_fly_with(stand: St
 
 def test_a_frame_that_was_not_solved_has_no_pose(stand: Station) -> None:
     lost = estimate(9, state="LOST", reason="too few", position_m=None, quaternion_xyzw=None)
-    stand.say(estimate())
-    with Client(stand.port) as client:
+    with stand.client() as client:
         client.subscribe(f"/{PAYLOAD}/pose", f"/{PAYLOAD}/estimate", f"/{PAYLOAD}/scene")
         got = client.received[f"/{PAYLOAD}/estimate"]
         client.until(
@@ -181,8 +179,7 @@ def test_a_frame_that_was_not_solved_has_no_pose(stand: Station) -> None:
 
 
 def test_the_scene_has_marker_ellipsoid_and_trail(stand: Station) -> None:
-    with Client(stand.port) as client:
-        stand.say(estimate())
+    with stand.client() as client:
         client.subscribe(f"/{PAYLOAD}/scene")
         found: dict[str, Any] = {}
         x = iter(range(1000))
@@ -220,9 +217,8 @@ def test_the_scene_has_marker_ellipsoid_and_trail(stand: Station) -> None:
 
 
 def test_pictures_are_the_rings_with_their_capture_time_and_points(stand: Station) -> None:
-    stand.say(estimate())
     sequence = iter(range(10_000))
-    with Client(stand.port) as client:
+    with stand.client() as client:
         client.subscribe(f"/{PAYLOAD}/camera/image", f"/{PAYLOAD}/camera/points")
         log_ns, image = client.first(
             f"/{PAYLOAD}/camera/image", lambda: stand.show(RAMP, next(sequence))
@@ -237,8 +233,7 @@ def test_pictures_are_the_rings_with_their_capture_time_and_points(stand: Statio
 
 
 def test_pictures_come_no_faster_than_the_dashboards(stand: Station) -> None:
-    stand.say(estimate())
-    with Client(stand.port) as client:
+    with stand.client() as client:
         client.subscribe(f"/{PAYLOAD}/camera/image")
         begin_s, sequence = time.monotonic(), 0
         while time.monotonic() - begin_s < 1.5:
@@ -261,12 +256,7 @@ def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(stand: 
         f"/{PAYLOAD}/battery", f"/{PAYLOAD}/health", f"/{PAYLOAD}/status",
         f"/{PAYLOAD}/camera/calibration", f"/{PAYLOAD}/scene",
     )  # fmt: skip
-    with Client(stand.port) as first:
-        first.until(
-            lambda: f"/{PAYLOAD}/scene" in first.channels,
-            "payload",
-            lambda: stand.say(estimate()),
-        )
+    with stand.client() as first:
         first.subscribe(*kept)
 
         def say() -> None:
@@ -279,7 +269,7 @@ def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(stand: 
         first.until(lambda: all(first.received[topic] for topic in kept), "all", say)
         first.drain()
         before = {topic: len(first.received[topic]) for topic in kept}
-        with Client(stand.port) as second:
+        with stand.client() as second:
             second.subscribe(*kept)
             second.until(lambda: all(second.received[topic] for topic in kept), "what holds")
             first.drain()
@@ -309,8 +299,7 @@ def test_a_new_subscriber_is_told_what_still_holds_and_nobody_else_again(stand: 
 
 
 def test_notes_that_cannot_be_end_nothing(stand: Station) -> None:
-    with Client(stand.port) as client:
-        stand.say(estimate())
+    with stand.client() as client:
         client.subscribe(f"/{PAYLOAD}/estimate", f"/{PAYLOAD}/scene", "/events", "/log")
         hostile: list[Any] = [
             estimate(1, state=[1], reason=5, map={"a": 1}),
@@ -339,16 +328,15 @@ def test_notes_that_cannot_be_end_nothing(stand: Station) -> None:
             lambda: any(said.message == "next: one" for _, said in client.received["/log"]),
             "the next event",
         )
-        with Client(stand.port) as later:
+        with stand.client() as later:
             later.subscribe("/log")
             later.until(lambda: bool(later.received["/log"]), "what was kept")
         assert not any("No Payload" in topic for topic in client.channels)
 
 
 def test_a_client_that_does_not_read_delays_nobody(stand: Station) -> None:
-    stand.say(estimate())
     topics = tuple(topic for topic in SCHEMAS if topic.startswith(f"/{PAYLOAD}/"))
-    with Client(stand.port) as slow, Client(stand.port) as quick:
+    with stand.client() as slow, stand.client() as quick:
         slow.subscribe(*topics)
         quick.subscribe(f"/{PAYLOAD}/estimate")
         long = "x" * 100_000  # more than sockets and the slow client's queue can hold
@@ -385,10 +373,9 @@ def test_a_bus_that_comes_back_is_heard_again(tmp_path: Path) -> None:
     topic = f"/{PAYLOAD}/estimate"
     with (
         Station(tmp_path) as station,
-        server(tmp_path) as (process, port),
-        Client(port) as client,
+        server(tmp_path) as (process, station.port),
+        station.client() as client,
     ):
-        station.say(estimate())
         client.subscribe(topic)
         client.first(topic, lambda: station.say(estimate()))
         station.close()
