@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from study import metrics
-from study.feeding import dark_frames, feed, feed_paced, joined
+from study.feeding import feed, joined
 from study.recovering import SETTLED, Settled, draw_places
 from study.row import Line
 from study.run import NEEDS, ROWS, parser, run, table
@@ -89,31 +89,7 @@ def test_every_frame_is_given_with_its_exposure() -> None:
     localizer: Any = Still()
     flown = feed(localizer, frames(5))
     assert localizer.given == [(k, 0.01) for k in range(5)]
-    assert flown.dropped == 0 and flown.says(State.TRACKING).all() and flown.wTc.shape == (5, 4, 4)
-
-
-def test_paced_a_slow_frame_is_late_and_the_newest_of_those_that_came_wins() -> None:
-    now_s = [100.0]
-
-    class Clocked(Still):
-        """Every frame takes 1 ms of a clock of its own, the slow one half a second."""
-
-        def process(self, *args: Any, **kwargs: Any) -> PoseEstimate:
-            estimate = super().process(*args, **kwargs)
-            now_s[0] += 0.5 if estimate.index == 1 else 0.001
-            return estimate
-
-    def sleep(seconds: float) -> None:
-        now_s[0] += seconds + 1e-9
-
-    localizer: Any = Clocked()
-    flown = feed_paced(localizer, frames(40, 20_000_000), clock=lambda: now_s[0], sleep=sleep)
-    # Frame 1 is there from 20 ms on and done by 520 ms: 2 to 26 have come.
-    assert [index for index, _ in localizer.given] == [0, 1, *range(26, 40)]
-    assert flown.dropped == 24
-    assert flown.late_s[1] == pytest.approx(0.5, abs=0.001)
-    assert flown.late_s[2] == pytest.approx(0.001, abs=1e-4)
-    assert flown.late_s[-1] == pytest.approx(0.001, abs=1e-4)
+    assert flown.says(State.TRACKING).all() and flown.wTc.shape == (5, 4, 4)
 
 
 def test_a_jump_joins_two_flights_with_times_that_go_on() -> None:
@@ -131,11 +107,6 @@ def test_places_of_a_jump_are_on_two_flights_and_leave_room() -> None:
     assert {a for a, *_ in drawn} == {b for _, _, b, _ in drawn} == {0, 1, 2}
     assert all(i + 30 <= len(flights[a].frames) for a, i, _, _ in drawn)
     assert all(j + 50 <= len(flights[b].frames) for _, _, b, j in drawn)
-
-
-def test_darkness_is_dark_and_noisy() -> None:
-    dark = dark_frames((48, 64), 20, np.random.default_rng(0))
-    assert len(dark) == 20 and all(f.image.mean() < 10 and f.image.std() > 0.5 for f in dark)
 
 
 def test_a_table_tells_what_is_met_and_missed() -> None:
@@ -156,7 +127,7 @@ def test_a_row_without_its_flights_is_refused_in_one_line(
 
 def test_a_missing_flight_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sample = Path(__file__).parents[2] / "maps/atrium"
-    words = ["single", "--map", str(sample), "--flights", str(tmp_path / "none.mcap")]
+    words = ["others", "--map", str(sample), "--others", str(tmp_path / "none.mcap")]
     assert run(parser().parse_args([*words, "--json", str(tmp_path / "a.json")])) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "none.mcap" in error

@@ -1,13 +1,10 @@
-"""Flights in memory, and a localizer that gets their frames: at once, or each at its time."""
+"""Flights in memory, and a localizer that gets their frames."""
 
 from __future__ import annotations
 
-import time
-from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from study.metrics import pose_errors
@@ -66,12 +63,10 @@ def load_flight(spec: str, limit: int | None = None) -> Flight:
 
 @dataclass
 class Run:
-    """What a localizer said of each frame it got; `late_s`, when paced, from capture to pose."""
+    """What a localizer said of each frame it got."""
 
     frames: list[Frame] = field(default_factory=list)
     estimates: list[PoseEstimate] = field(default_factory=list)
-    late_s: list[float] = field(default_factory=list)
-    dropped: int = 0
 
     def says(self, state: State) -> Bools:
         """Which frames (N,) are in a state."""
@@ -97,66 +92,19 @@ def make_localizer(map_: Map, camera: Camera, settings: LocalizerSettings) -> Lo
     return Localizer(map_, camera, extractor_for(map_.info, settings.features), settings)
 
 
-class Feed(Protocol):
-    """Gives frames to a localizer, until `enough` is true of the run so far, or to their end."""
-
-    def __call__(
-        self,
-        localizer: Localizer,
-        frames: Iterable[Frame],
-        enough: Callable[[Run], bool] | None = None,
-    ) -> Run: ...
-
-
 def feed(
     localizer: Localizer, frames: Iterable[Frame], enough: Callable[[Run], bool] | None = None
 ) -> Run:
-    """Gives frame after frame, as fast as they are taken."""
+    """Gives frame after frame, until `enough` is true of the run so far, or to their end."""
     run = Run()
     for frame in frames:
-        _give(localizer, frame, run)
+        run.frames.append(frame)
+        run.estimates.append(
+            localizer.process(frame.time_ns, frame.image, frame.index, frame.exposure_s)
+        )
         if enough is not None and enough(run):
             break
     return run
-
-
-def feed_paced(
-    localizer: Localizer,
-    frames: Iterable[Frame],
-    enough: Callable[[Run], bool] | None = None,
-    clock: Callable[[], float] = time.perf_counter,
-    sleep: Callable[[float], None] = time.sleep,
-) -> Run:
-    """Gives each frame at its time; of those that pile up the newest wins, as in the service."""
-    run, queue = Run(), deque[tuple[float, Frame]]()
-    ahead = iter(frames)
-    upcoming = next(ahead, None)
-    first_ns = upcoming.time_ns if upcoming else 0
-    start_s = clock()
-    while upcoming is not None or queue:
-        now_s = clock() - start_s
-        while upcoming is not None and (upcoming.time_ns - first_ns) / 1e9 <= now_s:
-            queue.append(((upcoming.time_ns - first_ns) / 1e9, upcoming))
-            upcoming = next(ahead, None)
-        while len(queue) > 1:
-            queue.popleft()
-            run.dropped += 1
-        if queue:
-            due_s, frame = queue.popleft()
-            _give(localizer, frame, run)
-            run.late_s.append(clock() - start_s - due_s)
-            if enough is not None and enough(run):
-                break
-        elif upcoming is not None:
-            sleep(max(0.0, (upcoming.time_ns - first_ns) / 1e9 - now_s))
-    return run
-
-
-def _give(localizer: Localizer, frame: Frame, run: Run) -> None:
-    run.frames.append(frame)
-    run.estimates.append(
-        localizer.process(frame.time_ns, frame.image, frame.index, frame.exposure_s)
-    )
 
 
 def joined(parts: Sequence[Sequence[Frame]], rate_hz: float = 30.0) -> list[Frame]:
@@ -166,11 +114,3 @@ def joined(parts: Sequence[Sequence[Frame]], rate_hz: float = 30.0) -> list[Fram
         replace(frame, index=k, time_ns=1_000_000_000 + round(k * 1e9 / rate_hz))
         for k, frame in enumerate(frames)
     ]
-
-
-def dark_frames(shape: tuple[int, int], count: int, rng: np.random.Generator) -> list[Frame]:
-    """Black pictures (H, W) with a sensor's noise, exposed as long as it goes."""
-    pool = [
-        np.clip(rng.normal(3.0, 3.0, shape), 0, 255).astype(np.uint8) for _ in range(min(count, 12))
-    ]
-    return [Frame(k, f"dark-{k}", 0, pool[k % len(pool)], 1 / 60) for k in range(count)]

@@ -1,18 +1,16 @@
-"""Rows about being lost: kidnapping, other buildings, a blackout."""
+"""Rows about being lost: kidnapping, other buildings."""
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from study.feeding import Flight, Run, dark_frames, joined, make_localizer
+from study.feeding import Flight, Run, feed, joined, make_localizer
 from study.metrics import (
     NEAR_DEG,
     NEAR_M,
-    Recovery,
     percentile_of,
     pose_errors,
     recovery,
@@ -32,8 +30,6 @@ AFTER = 150
 """And after it at most: five seconds."""
 SETTLED = 20
 """Frames that say TRACKING near the truth one after the other: a jump is over."""
-DARK = 150
-"""Frames of a blackout: five seconds."""
 _RATE_HZ = 30.0
 
 
@@ -110,12 +106,11 @@ def _jump(study: Study, before: Flight, i: int, after: Flight, j: int) -> dict[s
     localizer = make_localizer(study.map_, after.camera, study.settings)
     localizer.set_initial_pose(before.true_wTc(old[:1])[0], stream[0].time_ns)
     true_wTc = after.true_wTc(new)
-    run = study.feed(localizer, stream, Settled(len(old), true_wTc))
+    run = feed(localizer, stream, Settled(len(old), true_wTc))
     there = np.array([frame.index >= len(old) for frame in run.frames], bool)
     kept = [frame.index - len(old) for frame in run.frames if frame.index >= len(old)]
     m, deg = (values[there] for values in run.errors(_padded(true_wTc[kept], there)))
-    late_s = np.array(run.late_s)[there] if run.late_s else 0.0
-    found = recovery(np.array(kept) / _RATE_HZ + late_s, run.says(State.TRACKING)[there], m, deg)
+    found = recovery(np.array(kept) / _RATE_HZ, run.says(State.TRACKING)[there], m, deg)
     return {
         "from": [before.about, i],
         "to": [after.about, j],
@@ -132,56 +127,6 @@ def _padded(truth: np.ndarray, where: np.ndarray) -> np.ndarray:
     return result
 
 
-def blackout(study: Study) -> Row:
-    """Two seconds of a flight, five of darkness, then light at a place of another flight."""
-    flights = [study.flight(spec) for spec in study.flights]
-    rng = np.random.default_rng(study.seed + 1)
-    each: list[dict[str, Any]] = []
-    for _ in range(study.repetitions):
-        a, i, b, j = draw_places(flights, rng, 2 * BEFORE, AFTER)
-        old, new = flights[a].frames[i : i + 2 * BEFORE], flights[b].frames[j : j + AFTER]
-        dark = dark_frames(old[0].image.shape, DARK, rng)
-        stream = joined([old, dark, new], _RATE_HZ)
-        localizer = make_localizer(study.map_, flights[b].camera, study.settings)
-        localizer.set_initial_pose(flights[a].true_wTc(old[:1])[0], stream[0].time_ns)
-        true_wTc = flights[b].true_wTc(new)
-        run = study.feed(localizer, stream, Settled(len(old) + len(dark), true_wTc))
-        index = np.array([frame.index for frame in run.frames])
-        late_s = np.array(run.late_s) if run.late_s else np.zeros(len(index))
-        night = (index >= len(old)) & (index < len(old) + len(dark))
-        day = index >= len(old) + len(dark)
-        lost = run.says(State.LOST) & night
-        seconds = (index - len(old)) / _RATE_HZ + late_s
-        kept = index[day] - len(old) - len(dark)
-        m, deg = (values[day] for values in run.errors(_padded(true_wTc[kept], day)))
-        light_s = seconds[day] - DARK / _RATE_HZ
-        found: Recovery = recovery(light_s, run.says(State.TRACKING)[day], m, deg)
-        each.append(
-            {
-                "from": [flights[a].about, i],
-                "to": [flights[b].about, j],
-                "lost_s": float(seconds[lost.argmax()]) if lost.any() else float("inf"),
-                "tracking_in_the_dark": int((run.says(State.TRACKING) & night).sum()),
-                "localized_in_the_dark": int((run.localized & night).sum()),
-                **vars(found),
-            }
-        )
-    lost_s = max(one["lost_s"] for one in each)
-    back_s = max(one["recovered_s"] for one in each)
-    wrong = sum(one["wrong"] for one in each)
-    dark_frames_tracking = sum(one["tracking_in_the_dark"] for one in each)
-    figure = (
-        f"LOST after at most {lost_s:.2f} s; TRACKING {back_s:.2f} s after light at most, "
-        f"{percentile_of([one['recovered_s'] for one in each], 50):.2f} s median; "
-        f"{dark_frames_tracking} dark frames TRACKING, {wrong} wrong after"
-    )
-    met = lost_s <= 0.5 and back_s <= 1.0 and not wrong
-    bound = "LOST in 0.5 s, TRACKING within 1 s of light"
-    about = f"{seeds(flights)}; places {study.seed + 1}"
-    return Row([Line(f"blackout of 5 s, {len(each)} times", bound, figure, met, about)],
-               {"each": each})  # fmt: skip
-
-
 def other_buildings(study: Study) -> Row:
     """Frames of other buildings, each on its own and as streams: none may be accepted."""
     flights = [study.flight(spec) for spec in study.others]
@@ -189,7 +134,7 @@ def other_buildings(study: Study) -> Row:
     streams: dict[str, Any] = {}
     for flight in flights:
         localizer = make_localizer(study.map_, flight.camera, study.settings)
-        run = study.feed(localizer, flight.frames)
+        run = feed(localizer, flight.frames)
         streams[f"{flight.name}: {flight.about}"] = {
             "frames": len(run.frames),
             "localized": int(run.localized.sum()),
@@ -207,54 +152,27 @@ def other_buildings(study: Study) -> Row:
     return Row([line], {"alone": alone, "streams": streams})
 
 
-def single_frames(study: Study) -> Row:
-    """Frames of known flights, each asked on its own: found where they were taken, or refused."""
-    flights = [study.flight(spec) for spec in study.flights]
-    alone = ask_alone(study, flights)
-    found = alone["accepted"]
-    m, deg = (np.array([one[key] for one in found]) for key in ("error_m", "error_deg"))
-    alone["wrong"] = int(((m > NEAR_M) | (deg > NEAR_DEG)).sum())
-    figure = f"{len(found)} of {alone['frames']} found, {alone['wrong']} of them wrong"
-    if found:
-        figure += f"; median {np.median(m):.3f} m, {np.median(deg):.2f} deg, worst {m.max():.3f} m"
-    figure += f"; {alone['cpu_ms']['median']:.0f} ms CPU median, {alone['cpu_ms']['p95']:.0f} p95"
-    line = Line("relocalization of single frames", "", figure, None, seeds(flights))
-    return Row([line], {"alone": alone})
-
-
 def ask_alone(study: Study, flights: Sequence[Flight]) -> dict[str, Any]:
-    """Asks for the place of `study.count` frames, each with no frame before it.
-
-    Processor time is the process's, features aside: set OMP_NUM_THREADS=1, or waiting threads
-    count, too.
-    """
+    """Asks for the place of `study.count` frames, each with no frame before it."""
     every = [(k, frame) for k, flight in enumerate(flights) for frame in flight.frames]
     step = max(1.0, len(every) / study.count)
     chosen = [every[int(k * step)] for k in range(min(study.count, len(every)))]
     settings = study.settings
     extractor = extractor_for(study.map_.info, settings.features)
     finders = [Relocalizer(study.map_, f.camera, settings.recovery, settings.seed) for f in flights]
-    accepted, refused, took = [], Counter[str](), []
+    accepted, refused = [], Counter[str]()
     for k, frame in chosen:
         features = extractor.extract(frame.image)
         seen = describe(features, flights[k].camera, Conditions())
-        begin = time.process_time()
         found = finders[k].candidates(seen)
         if not isinstance(found, str):
             found = finders[k].alone(found)
-        took.append(1e3 * (time.process_time() - begin))
         if isinstance(found, str):
             refused[without_numbers(found)] += 1
-            continue
-        one: dict[str, Any] = {"flight": flights[k].about, "frame": frame.index}
-        if flights[k].truth is not None:
-            m, deg = pose_errors(found.wTc, flights[k].true_wTc([frame]))
-            one |= {"error_m": float(m[0]), "error_deg": float(deg[0])}
-        accepted.append(one)
-    p50, p95, top = np.percentile(took, [50, 95, 100])
+        else:
+            accepted.append({"flight": flights[k].about, "frame": frame.index})
     return {
         "frames": len(chosen),
         "accepted": accepted,
         "refused": dict(refused.most_common(8)),
-        "cpu_ms": {"median": p50, "p95": p95, "max": top},
     }

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from study.feeding import Feed, Flight, feed, load_flight
+from study.feeding import Flight, load_flight
 
 from ground_station.localization.settings import LocalizerSettings
 from ground_station.map.store import Map
@@ -33,7 +33,7 @@ class Row:
 
 @dataclass
 class Study:
-    """What every row needs: map, settings, the way of feeding, sizes, and flights kept in memory.
+    """What every row needs: map, settings, sizes, and flights kept in memory.
 
     `limit` is the most frames of a flight that are used, None for all.
     """
@@ -42,10 +42,8 @@ class Study:
     settings: LocalizerSettings
     flights: Sequence[str]
     others: Sequence[str]
-    feed: Feed = feed
     limit: int | None = None
     jumps: int = 200
-    repetitions: int = 10
     count: int = 1000
     seed: int = 0
     _kept: dict[str, Flight] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""What the localizer says when it is lost, measured: run by hand, not by pytest.
+"""What the localizer says when it is lost, as its README tells: run by hand, not by pytest.
 
     python tests/localization/study/run.py all --flights out/study/loop-*.mcap \\
         --others out/reloc/office-*.mcap --json out/study.json
@@ -25,7 +25,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from study import recovering
-from study.feeding import feed, feed_paced
 from study.row import Line, Row, Study
 
 from ground_station.bench.machine import machine
@@ -38,11 +37,9 @@ from pi_firmware.wire.errors import BlimpError
 
 ROWS = {
     "kidnapping": recovering.kidnapping,
-    "blackout": recovering.blackout,
     "others": recovering.other_buildings,
-    "single": recovering.single_frames,
 }
-NEEDS = {"kidnapping": "flights", "blackout": "flights", "single": "flights", "others": "others"}
+NEEDS = {"kidnapping": "flights", "others": "others"}
 """What flights of the user's a row cannot be run without."""
 
 
@@ -55,12 +52,9 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--map", default="maps/atrium", help="the flights' map (maps/atrium)")
     p.add_argument("--flights", nargs="*", default=[], help="flights to jump between")
     p.add_argument("--others", nargs="*", default=[], help="flights of other buildings")
-    p.add_argument("--paced", action="store_true",
-                   help="give each frame at its time; else as fast as they are taken")  # fmt: skip
     p.add_argument("--settings", metavar="FILE.toml", help="instead of the preset default")
     p.add_argument("--limit", type=int, help="most frames of a flight, for a quick look")
     p.add_argument("--jumps", type=int, default=200, help="kidnappings (200)")
-    p.add_argument("--repetitions", type=int, default=10, help="blackouts (10)")
     p.add_argument("--count", type=int, default=1000, help="frames asked on their own (1000)")
     p.add_argument("--seed", type=int, default=0, help="of the places that are drawn (0)")
     p.add_argument("--cores", type=int, default=2, help="processor cores it may use (2)")
@@ -89,10 +83,8 @@ def study_of(args: argparse.Namespace) -> Study:
         settings=settings,
         flights=args.flights,
         others=args.others,
-        feed=feed_paced if args.paced else feed,
         limit=args.limit,
         jumps=args.jumps,
-        repetitions=args.repetitions,
         count=args.count,
         seed=args.seed,
     )
@@ -105,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         if name in NEEDS and not getattr(args, NEEDS[name]):
             print(f"study: the row '{name}' needs --{NEEDS[name]}", file=sys.stderr)
             return 2
-    result: dict[str, Any] = {"machine": machine(), "paced": args.paced, "seed": args.seed}
+    result: dict[str, Any] = {"machine": machine(), "seed": args.seed}
     try:
         study = study_of(args)
         result |= {"map": args.map, "settings": asdict(study.settings), "rows": {}}
