@@ -2,29 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from synthetic import CAMERA, DIMENSION, NO_KEYFRAMES, FakeExtractor, landmarks_at, unit, unit_rows
 
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
-from ground_station.geometry.camera import THESIS_CAMERA, Camera
-from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo
-
-DIMENSION = 64
-CAMERA = replace(THESIS_CAMERA, readout_s=0.0)
-"""All rows at once, as the synthetic frames have them."""
-
-
-class FakeExtractor:
-    """Names the synthetic features; takes no pictures."""
-
-    name, sha256, dimension = "synthetic", "0" * 64, DIMENSION
-    distance_scale = 1.0
-
-    def extract(self, image: np.ndarray) -> Features:
-        raise AssertionError("synthetic frames have no pictures")
+from ground_station.geometry.camera import Camera
+from ground_station.map.store import Map, MapInfo
 
 
 def looking(position_m: np.ndarray, target_m: np.ndarray) -> np.ndarray:
@@ -33,11 +20,6 @@ def looking(position_m: np.ndarray, target_m: np.ndarray) -> np.ndarray:
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)
     return poses.pose(np.stack([x, np.cross(z, x), z], axis=1), position_m)
-
-
-def unit_rows(rng: np.random.Generator, count: int) -> np.ndarray:
-    rows = rng.normal(size=(count, DIMENSION))
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
 @dataclass
@@ -73,16 +55,14 @@ class Room:
         seen &= ((pixels >= 0) & (pixels <= size)).all(axis=1)
         index = self.rng.permutation(np.flatnonzero(seen))[:most]
         pixels = pixels[index] + self.rng.normal(0, noise_px, (len(index), 2))
-        descriptors = self.map.landmarks.descriptor[index] + self.rng.normal(
-            0, 0.03, (len(index), DIMENSION)
-        )
-        descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
+        noise = self.rng.normal(0, 0.03, (len(index), DIMENSION))
+        descriptors = unit(self.map.landmarks.descriptor[index] + noise)
         wrong = self.rng.random(len(index)) < outliers
         pixels[wrong] = self.rng.uniform(0, size, (int(wrong.sum()), 2))
         return Features(
             pixels.astype(np.float32),
             np.ones(len(index), np.float32),
-            descriptors.astype(np.float32),
+            descriptors,
         )
 
 
@@ -97,35 +77,15 @@ def room() -> Room:
     points[:, 2] += 1.5
     towards = np.array([0.0, 0.0, 1.5]) - points
     distance = np.linalg.norm(towards, axis=1)
-    landmarks = Landmarks(
-        id=np.arange(count, dtype=np.int64),
-        position_m=points,
-        covariance_m2=np.tile(np.eye(3, dtype=np.float32) * 1e-4, (count, 1, 1)),
-        descriptor=unit_rows(rng, count),
-        spread=np.full(count, 0.1, np.float32),
+    landmarks = landmarks_at(
+        points,
+        unit_rows(rng, count),
         view_direction=(towards / distance[:, None]).astype(np.float32),
-        view_cos=np.full(count, 0.5, np.float32),
         distance_m=np.stack([0.4 * distance, 1.6 * distance], axis=1).astype(np.float32),
-        observations=np.full(count, 5, np.int32),
     )
-    keyframes = Keyframes(
-        names=[],
-        time_ns=np.empty(0, np.int64),
-        wTc=np.empty((0, 4, 4)),
-        offset=np.zeros(1, np.int64),
-        landmark=np.empty(0, np.int32),
-        pixel_px=np.empty((0, 2), np.float32),
-    )
-    info = MapInfo(
-        FakeExtractor.name,
-        FakeExtractor.sha256,
-        DIMENSION,
-        CAMERA,
-        name="room",
-        frame="world",
-        units="m",
-    )
-    return Room(Map(info, landmarks, keyframes), CAMERA, rng)
+    fake = FakeExtractor
+    info = MapInfo(fake.name, fake.sha256, DIMENSION, CAMERA, "room", "world", "m")
+    return Room(Map(info, landmarks, NO_KEYFRAMES), CAMERA, rng)
 
 
 @pytest.fixture

@@ -6,38 +6,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from synthetic import all_compared, unit, unit_rows
 
 from ground_station.localization.association import associate
 from ground_station.localization.settings import AssociationSettings
-
-
-def _unit(rng, count, dimension, lean=0.0):
-    rows = rng.normal(size=(count, dimension)) + lean
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
-
-
-def _by_brute_force(fp, fd, lp, ld, options, radius):
-    """Every distance in double precision; of equals the lowest index wins."""
-    apart = np.sqrt(((fp[:, None] - lp[None]) ** 2).sum(axis=2))
-    distance = np.sqrt(((fd[:, None].astype(float) - ld[None]) ** 2).sum(axis=2))
-    distance[apart > radius] = np.inf
-    best = {}
-    for i, row in enumerate(distance):
-        j = int(np.argmin(row))
-        if row[j] >= options.max_descriptor_distance:
-            continue
-        if options.max_ratio < 1 and row[j] > options.max_ratio * np.delete(row, j).min(initial=9):
-            continue
-        if j not in best or row[j] < best[j][0]:
-            best[j] = (row[j], i)
-    return sorted((i, j) for j, (_, i) in best.items())
 
 
 def _pairs(found):
     return list(zip(found.feature.tolist(), found.candidate.tolist(), strict=True))
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=60)
 @given(
     seed=st.integers(0, 10_000),
     features=st.integers(1, 120),
@@ -46,30 +25,36 @@ def _pairs(found):
     radius=st.sampled_from([3.0, 40.0, 150.0, 2000.0]),
     ratio=st.sampled_from([1.0, 0.9, 0.5]),
     lean=st.sampled_from([0.0, 1.0]),
+    each_its_own=st.booleans(),
 )
 def test_the_pairs_are_those_of_all_distances(
-    seed, features, landmarks, dimension, radius, ratio, lean
+    seed, features, landmarks, dimension, radius, ratio, lean, each_its_own
 ):
     rng = np.random.default_rng(seed)
     lp = rng.uniform(-100, 700, (landmarks, 2))
     # Some features have no landmark at all; some landmarks are wanted by several features.
-    ld = _unit(rng, landmarks, dimension, lean)
+    ld = unit(rng.normal(size=(landmarks, dimension)) + lean)
     own = rng.integers(0, landmarks, features)
     fp = lp[own] + rng.normal(0, 0.5 * radius, (features, 2))
-    fd = ld[own] + rng.normal(0, 0.5 / np.sqrt(dimension), (features, dimension))
-    fd = (fd / np.linalg.norm(fd, axis=1, keepdims=True)).astype(np.float32)
-    options = AssociationSettings(max_ratio=ratio)
-    found = associate(fp, fd, lp, ld, options, radius)
-    assert _pairs(found) == _by_brute_force(fp, fd, lp, ld, options, radius)
-    if len(found):
-        apart = np.linalg.norm(fd[found.feature] - ld[found.candidate], axis=1)
-        assert np.allclose(found.distance, apart, atol=1e-5)
+    fd = unit(ld[own] + rng.normal(0, 0.5 / np.sqrt(dimension), (features, dimension)))
+    options, limit = AssociationSettings(max_ratio=ratio), None
+    if each_its_own:
+        radius, limit = rng.uniform(0, 2 * radius, landmarks), rng.uniform(0.2, 1.0)
+        radius[::9] = np.nan
+    found = associate(fp, fd, lp, ld, options, radius, limit)
+    with np.errstate(invalid="ignore"):
+        near = np.linalg.norm(fp[:, None] - lp[None], axis=2) <= radius
+    distance = np.linalg.norm(fd[:, None].astype(float) - ld[None], axis=2)
+    limit = options.max_descriptor_distance if limit is None else limit
+    assert _pairs(found) == all_compared(distance, near, limit, ratio)
+    apart = np.linalg.norm(fd[found.feature] - ld[found.candidate], axis=1)
+    assert np.allclose(found.distance, apart, atol=1e-5)
 
 
 @pytest.mark.parametrize("dimension", [32, 256])
 def test_of_equal_landmarks_the_first_is_taken_and_none_stands_out(dimension):
     rng = np.random.default_rng(5)
-    row = _unit(rng, 1, dimension)
+    row = unit_rows(rng, 1, dimension)
     lp = np.array([[300.0, 200.0], [310.0, 210.0], [290.0, 190.0], [600.0, 20.0]])
     ld = np.repeat(row, 4, axis=0)
     fp, fd = np.array([[301.0, 201.0]]), row.copy()
@@ -80,7 +65,7 @@ def test_of_equal_landmarks_the_first_is_taken_and_none_stands_out(dimension):
 
 def test_of_equal_features_the_first_keeps_the_landmark():
     rng = np.random.default_rng(6)
-    row = _unit(rng, 1, 256)
+    row = unit_rows(rng, 1, 256)
     fp, fd = np.array([[10.0, 10.0], [20.0, 90.0], [0.0, 0.0]]), np.repeat(row, 3, axis=0)
     found = associate(fp, fd, np.array([[12.0, 40.0]]), row, AssociationSettings(), 100.0)
     assert _pairs(found) == [(0, 0)]
@@ -98,38 +83,6 @@ def test_nothing_near_and_nothing_alike_are_no_pairs():
     here, there = np.zeros((1, 2)), np.full((1, 2), 400.0)
     assert len(associate(here, rows[:1], there, rows[:1], AssociationSettings())) == 0
     assert len(associate(here, rows[:1], here, rows[1:], AssociationSettings())) == 0
-
-
-@settings(deadline=None, max_examples=40)
-@given(
-    seed=st.integers(0, 10_000),
-    dimension=st.sampled_from([16, 256]),
-    ratio=st.sampled_from([1.0, 0.8]),
-)
-def test_each_landmark_keeps_its_own_radius(seed, dimension, ratio):
-    rng = np.random.default_rng(seed)
-    lp, ld = rng.uniform(0, 300, (80, 2)), _unit(rng, 80, dimension)
-    own = rng.integers(0, 80, 60)
-    fp = lp[own] + rng.normal(0, 8, (60, 2))
-    fd = ld[own] + rng.normal(0, 0.5 / np.sqrt(dimension), (60, dimension))
-    fd = (fd / np.linalg.norm(fd, axis=1, keepdims=True)).astype(np.float32)
-    radius, limit = rng.uniform(0, 30, 80), rng.uniform(0.2, 1.0)
-    radius[::9] = np.nan
-    options = AssociationSettings(max_ratio=ratio)
-    found = associate(fp, fd, lp, ld, options, radius, limit)
-
-    offset = fp[:, None] - lp[None]
-    distance = np.sqrt(((fd[:, None].astype(float) - ld[None]) ** 2).sum(axis=2))
-    with np.errstate(invalid="ignore"):
-        there = (np.linalg.norm(offset, axis=2) <= radius) & (distance <= limit / ratio)
-    distance[~there] = np.inf
-    best = {}
-    for i, row in enumerate(distance):
-        j = int(np.argmin(row))
-        stands_out = row[j] < limit and row[j] <= ratio * np.delete(row, j).min()
-        if stands_out and (j not in best or row[j] < best[j][0]):
-            best[j] = (row[j], i)
-    assert _pairs(found) == sorted((i, j) for j, (_, i) in best.items())
 
 
 def test_landmarks_without_a_usable_radius_are_not_paired():

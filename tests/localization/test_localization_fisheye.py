@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from synthetic import apart, unit
 
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
@@ -44,12 +45,11 @@ class Wide:
         rng, pixels = self.room.rng, self.seen(wTc)
         index = rng.permutation(np.flatnonzero(np.isfinite(pixels[:, 0])))[:most]
         pixels = pixels[index] + rng.normal(0, self.noise_px, (len(index), 2))
-        rows = self.map.landmarks.descriptor[index] + rng.normal(0, 0.03, (len(index), 64))
-        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        rows = unit(self.map.landmarks.descriptor[index] + rng.normal(0, 0.03, (len(index), 64)))
         wrong = rng.random(len(index)) < outliers
         pixels[wrong] = rng.uniform(0, [639, 479], (int(wrong.sum()), 2))
         ones = np.ones(len(index), np.float32)
-        return Features(pixels.astype(np.float32), ones, rows.astype(np.float32))
+        return Features(pixels.astype(np.float32), ones, rows)
 
 
 @pytest.fixture
@@ -72,9 +72,8 @@ def test_a_flight_is_tracked_from_a_rough_first_pose(wide, room, extractor):
         # In the picture's pixels, wherever in it: 0.5 px of noise, landmarks free within theirs.
         inlier = estimate.observations.inlier
         assert np.median(estimate.observations.residual_px[inlier]) < 1.5
-        apart = poses.log(poses.inverse(wTc) @ estimate.wTc)
-        off.append([np.linalg.norm(apart[3:]), np.degrees(np.linalg.norm(apart[:3]))])
-    assert np.max(off, axis=0)[0] < 0.03 and np.max(off, axis=0)[1] < 0.5
+        off.append(apart(estimate.wTc, wTc))
+    assert (np.max(off, axis=0) < [0.03, np.radians(0.5)]).all()
 
 
 def test_a_frame_is_found_anywhere_in_the_map(wide, room, extractor):
@@ -82,7 +81,7 @@ def test_a_frame_is_found_anywhere_in_the_map(wide, room, extractor):
     times, path = room.path(1)
     estimate = localizer.process_features(int(times[0]), wide.features(path[0]))
     assert estimate.localized, estimate.reason
-    assert np.linalg.norm((poses.inverse(path[0]) @ estimate.wTc)[:3, 3]) < 0.03
+    assert apart(estimate.wTc, path[0])[0] < 0.03
 
 
 def test_the_noise_of_a_observation_grows_to_the_rim_as_its_pixels_do(wide, room):

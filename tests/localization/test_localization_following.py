@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from synthetic import FakeExtractor, apart, preset_with, unit
 
 from ground_station.experiments.alter import scaled_camera
 from ground_station.geometry import poses
@@ -26,13 +27,13 @@ from ground_station.localization.tracking import Keyframe
 from ground_station.map.uncertainty import Accuracy
 
 HERE = np.array([0.02, -0.01, 0.03, 0.02, 0.01, -0.02])
+SETTINGS = load_preset("default")
 
 
 @pytest.fixture
 def acquirer(room, extractor):
-    settings = load_preset("default")
-    matcher = Matcher(room.map, room.camera, settings)
-    return Acquirer(room.map, matcher, extractor, settings)
+    matcher = Matcher(room.map, room.camera, SETTINGS)
+    return Acquirer(room.map, matcher, extractor, SETTINGS)
 
 
 def seen_from(room, wTc):
@@ -40,24 +41,31 @@ def seen_from(room, wTc):
 
 
 def estimator_at(room, wTc, sigma=None):
-    estimator = make_estimator(room.camera, load_preset("default"))
+    estimator = make_estimator(room.camera, SETTINGS)
     estimator.restart(0, wTc, None if sigma is None else np.eye(6) * sigma**2)
     return estimator
 
 
+def find(acquirer, seen, estimator=None):
+    """A frame near what an estimator predicts, or anywhere."""
+
+    def make():
+        return make_estimator(acquirer.matcher.camera, SETTINGS)
+
+    expected = [] if estimator is None else [estimator.predict(0)]
+    return acquirer.find(seen, 0, expected, estimator or make(), make, Stopwatch())
+
+
 def test_live_nothing_is_waited_for_and_nothing_else_changes():
-    settings = load_preset("default")
-    live = for_live(settings)
-    assert settings.tracking.features_lag_s > 0 == live.tracking.features_lag_s
-    again = dataclasses.replace(live.tracking, features_lag_s=settings.tracking.features_lag_s)
-    assert dataclasses.replace(live, tracking=again) == settings
+    assert SETTINGS.tracking.features_lag_s > 0
+    assert for_live(SETTINGS) == preset_with(tracking={"features_lag_s": 0.0})
 
 
 def test_a_right_pose_explains_more_than_chance_and_wrong_ones_do_not(room, acquirer):
     _, path = room.path(120)
+    least = SETTINGS.tracking.min_significance
     for k in (0, 60, 119):
         seen = seen_from(room, path[k])
-        least = load_preset("default").tracking.min_significance
         assert acquirer.matcher.support(seen, path[k]).significance > 2 * least
         for other in ((k + 50) % 120, (k + 70) % 120):
             assert acquirer.matcher.support(seen, path[other]).significance < 0.7 * least
@@ -78,8 +86,8 @@ def test_a_search_near_a_wrong_and_certain_prediction_finds_nothing(room, acquir
         found = acquirer.locate(seen, right.predict(0), right, Stopwatch())
         sure = acquirer._verified(seen, found, Stopwatch())
         assert sure.solution is found.solution and sure.significance > 20
-        apart = poses.log(poses.inverse(path[k]) @ found.solution.state.wTc)
-        assert np.linalg.norm(apart[3:]) < 0.02 and np.linalg.norm(apart[:3]) < 0.005
+        metres, radians = apart(found.solution.state.wTc, path[k])
+        assert metres < 0.02 and radians < 0.005
 
 
 def test_a_frame_is_matched_around_until_its_pose_stays(room, acquirer, monkeypatch):
@@ -102,8 +110,7 @@ def test_a_frame_is_matched_around_until_its_pose_stays(room, acquirer, monkeypa
     monkeypatch.setattr(acquirer, "_locate_once", nearer)
     monkeypatch.setattr(acquirer, "_held_by_near", lambda seen, found, *_: found)
     found = acquirer.locate(seen, expected, estimator, Stopwatch())
-    apart = poses.log(poses.inverse(path[0]) @ found.solution.state.wTc)
-    assert rounds[0] > 38 and np.linalg.norm(apart) < 1e-6
+    assert rounds[0] > 38 and np.hypot(*apart(found.solution.state.wTc, path[0])) < 1e-6
     assert 7 <= len(rounds) <= 9  # 6 px each, and one that moves nothing
 
 
@@ -126,8 +133,7 @@ def test_what_few_landmarks_speak_for_is_held_against_what_is_found_anywhere(
         monkeypatch.setattr(
             acquirer, "_verified", lambda *_: dataclasses.replace(near, excess=excess)
         )
-        make = lambda: make_estimator(room.camera, load_preset("default"))  # noqa: E731
-        return acquirer.find(seen, 0, [estimator.predict(0)], estimator, make, Stopwatch())
+        return find(acquirer, seen, estimator)
 
     assert found(excess=0.3, significance=90).significance == 9 and not asked
     assert found(excess=0.01, significance=90).significance == 90 and asked
@@ -144,26 +150,18 @@ def test_a_pose_is_checked_up_to_the_models_own_distance(room, extractor):
     _, path = room.path(120)
     plain = room.features(path[0])
     noise = np.random.default_rng(1).normal(size=plain.descriptors.shape)
-    far = plain.descriptors + 1.3 * noise / np.linalg.norm(noise, axis=1, keepdims=True)
-    far = (far / np.linalg.norm(far, axis=1, keepdims=True)).astype(np.float32)
+    far = unit(plain.descriptors + 1.3 * unit(noise))
     off = np.linalg.norm(far - plain.descriptors, axis=1)
     assert np.quantile(off, 0.05) > 0.75 and np.quantile(off, 0.95) < 1.1
     seen = describe(dataclasses.replace(plain, descriptors=far), room.camera, Conditions())
-    settings = load_preset("default")
-
-    def acquirer(scale):
-        return Acquirer(
-            room.map, Matcher(room.map, room.camera, settings, scale), extractor, settings
-        )
-
-    def found(scale):
-        make = lambda: make_estimator(room.camera, settings)  # noqa: E731
-        return acquirer(scale).find(seen, 0, [], make(), make, Stopwatch()).solution.state
-
-    assert acquirer(1.0).matcher.support(seen, path[0]).share < 0.05
-    assert acquirer(1.6).matcher.support(seen, path[0]).significance > 10
-    assert found(1.0) is None
-    assert np.linalg.norm(poses.log(poses.inverse(path[0]) @ found(1.6).wTc)[3:]) < 0.03
+    near, wide = (
+        Acquirer(room.map, Matcher(room.map, room.camera, SETTINGS, scale), extractor, SETTINGS)
+        for scale in (1.0, 1.6)
+    )
+    assert near.matcher.support(seen, path[0]).share < 0.05
+    assert wide.matcher.support(seen, path[0]).significance > 10
+    assert find(near, seen).solution.state is None
+    assert apart(find(wide, seen).solution.state.wTc, path[0])[0] < 0.03
 
 
 def test_a_doubtful_find_counts_only_beside_a_prediction_that_says_where(room, acquirer):
@@ -183,10 +181,8 @@ def test_a_doubtful_find_counts_only_beside_a_prediction_that_says_where(room, a
             alone=lambda found: found[0].doubt or found[0],
         )
         estimator = estimator_at(room, path[0] @ poses.exp(HERE), sigma)
-        make = lambda: make_estimator(room.camera, load_preset("default"))  # noqa: E731
-        predicted = estimator.predict(0)
-        assert not acquirer.matcher.within_reach(predicted)
-        return acquirer.find(seen, 0, [predicted], estimator, make, Stopwatch())
+        assert not acquirer.matcher.within_reach(estimator.predict(0))
+        return find(acquirer, seen, estimator)
 
     near = found(path[0], sigma=0.06).solution.state
     assert near is not None
@@ -231,8 +227,7 @@ def test_a_model_of_larger_distances_has_larger_limits_and_no_others_change(room
     _, path = room.path(1)
     features = room.features(path[0], outliers=0.0)
     noise = np.random.default_rng(3).normal(0, 0.13, features.descriptors.shape)
-    moved = (features.descriptors + noise).astype(np.float32)
-    moved /= np.linalg.norm(moved, axis=1, keepdims=True)
+    moved = unit(features.descriptors + noise)
     features = dataclasses.replace(features, descriptors=moved)
     expected = estimator_at(room, path[0]).predict(0)
 
@@ -254,15 +249,14 @@ def test_a_model_of_larger_distances_has_larger_limits_and_no_others_change(room
 
 def test_landmarks_are_expected_where_their_row_will_see_them(room, extractor):
     camera = dataclasses.replace(room.camera, readout_s=0.02)
-    matcher = Matcher(room.map, camera, load_preset("default"))
+    matcher = Matcher(room.map, camera, SETTINGS)
     _, path = room.path(1)
     observations = matcher.observations(
         [[320.0, 0.0], [320.0, 239.5], [320.0, 479.0]], np.arange(3), 2.0,
         estimator_at(room, path[0]).predict(0), Conditions(),
     )  # fmt: skip
     assert np.allclose(observations.row_s, [-0.01, 0.0, 0.01])
-    off = dataclasses.replace(load_preset("default").pose, rolling_shutter=False)
-    still = Matcher(room.map, camera, dataclasses.replace(load_preset("default"), pose=off))
+    still = Matcher(room.map, camera, preset_with(pose={"rolling_shutter": False}))
     assert not still.row_s(np.array([[0.0, 0.0], [0.0, 479.0]])).any()
 
 
@@ -293,18 +287,16 @@ def test_catching_up_gives_up_where_the_points_are_not(room, acquirer):
         state=found.solution.state,
         keyframe=acquirer.keyframe(0, noise[0], path[0], found),
     )
-    fresh = make_estimator(room.camera, load_preset("default"))
+    fresh = make_estimator(room.camera, SETTINGS)
     assert catch_up(landed, [(0, noise[0])], acquirer.matcher, fresh)
     assert fresh.predict(0) is not None
-    fresh = make_estimator(room.camera, load_preset("default"))
+    fresh = make_estimator(room.camera, SETTINGS)
     recent = [(k * 33_000_000, noise[min(k, 1)]) for k in range(4)]
     assert not catch_up(landed, recent, acquirer.matcher, fresh)
 
 
-class Turning:
+class Turning(FakeExtractor):
     """A camera that turns on the spot; only its first view is ever described, and not at once."""
-
-    name, sha256, dimension, distance_scale = "synthetic", "0" * 64, 64, 1.0
 
     def __init__(self, room, wTc):
         self.seen, self.asked = room.features(wTc, noise_px=0.0, outliers=0.0), 0
@@ -334,19 +326,16 @@ def test_a_search_that_takes_long_is_caught_up_with_over_all_that_was_turned_sin
     """As on a slow computer, or a busy one: it was lost for as long as the camera moved."""
     wTc = room.path(1)[1][0]
     camera = Turning(room, wTc)
-    settings = load_preset("default")
-    tracking = dataclasses.replace(settings.tracking, features_lag_s=lag_s)
-    localizer = Localizer(
-        room.map, room.camera, camera, dataclasses.replace(settings, tracking=tracking)
-    )
+    settings = preset_with(tracking={"features_lag_s": lag_s})
+    localizer = Localizer(room.map, room.camera, camera, settings)
     for k in range(round(30 * lag_s) + 5):
         picture, turn = camera.turned(0.2 * max(k - 1, 0) / 30)
         found = localizer.process(k * 33_333_333, picture, k)
         if found.wTc is not None:
             break
     assert found.wTc is not None and k >= 30 * lag_s
-    off = poses.log(poses.inverse(wTc @ turn) @ found.wTc)
-    assert np.rad2deg(np.linalg.norm(off[:3])) < 0.2 and np.linalg.norm(off[3:]) < 0.02
+    metres, radians = apart(found.wTc, wTc @ turn)
+    assert np.rad2deg(radians) < 0.2 and metres < 0.02
 
 
 def test_frames_since_a_search_are_few_and_evenly_apart_and_end_with_the_last():
@@ -403,8 +392,7 @@ def test_pairs_that_chance_makes_are_left_out_and_right_ones_are_not(room, strip
     middle = abs(whole.keypoints_px[:, 0] - np.median(whole.keypoints_px[:, 0])) < strip_px / 2
     whole = whole.where(middle)
     rng = np.random.default_rng(4)
-    strange = rng.normal(0, 1, whole.descriptors.shape).astype(np.float32)
-    strange /= np.linalg.norm(strange, axis=1, keepdims=True)
+    strange = unit(rng.normal(0, 1, whole.descriptors.shape))
     order = rng.permutation(len(whole))
     features = dataclasses.replace(
         whole,
@@ -416,13 +404,8 @@ def test_pairs_that_chance_makes_are_left_out_and_right_ones_are_not(room, strip
     expected = estimator_at(room, path[0]).predict(0)
 
     def right_and_wrong(share):
-        settings = load_preset("default")
-        wide = dataclasses.replace(
-            settings.association, max_descriptor_distance=1.6, max_ratio=1.0, max_chance_share=share
-        )
-        matcher = Matcher(
-            room.map, room.camera, dataclasses.replace(settings, association=wide), 1.0
-        )
+        wide = {"max_descriptor_distance": 1.6, "max_ratio": 1.0, "max_chance_share": share}
+        matcher = Matcher(room.map, room.camera, preset_with(association=wide), 1.0)
         feature = matcher.match(described, expected, None, Stopwatch()).feature
         return (feature < len(whole)).sum(), (feature >= len(whole)).sum()
 

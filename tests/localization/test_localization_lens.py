@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from synthetic import CAMERA, FakeExtractor, preset_with
 
 from ground_station.experiments.alter import scaled_camera
 from ground_station.geometry import poses
@@ -15,7 +17,7 @@ from ground_station.localization.lens import against_map, considered
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.settings import load_preset
 from ground_station.map.store import Landmarks, MapInfo
-from tests.localization.conftest import CAMERA, FakeExtractor, Room
+from tests.localization.conftest import Room
 
 NAMES = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 
@@ -78,17 +80,13 @@ def test_a_bend_that_no_trajectory_measured_is_reckoned_with(room: Room) -> None
         assert of(registration, landmarks, False) == [[4, 0], [0, 0]]
 
 
-@pytest.mark.parametrize("share", [-0.005, 0.005])
-def test_another_cameras_focal_length_is_reckoned_with(
-    room: Room, extractor: FakeExtractor, share: float
-) -> None:
+def errors_of(room: Room, extractor: FakeExtractor) -> Callable[[float, Camera], float]:
     times, wTc = room.path(30)
     seen = [room.features(T) for T in wTc]
 
     def off(focal: float, camera: Camera) -> float:
         """The mean squared error over the covariance, of 6 where both fit."""
-        settings = load_preset("default")
-        settings = replace(settings, covariance=replace(settings.covariance, focal=focal))
+        settings = preset_with(covariance={"focal": focal})
         localizer = Localizer(room.map, camera, extractor, settings)
         localizer.set_initial_pose(wTc[0], int(times[0]))
         found = []
@@ -99,7 +97,18 @@ def test_another_cameras_focal_length_is_reckoned_with(
             found.append(float(error @ np.linalg.solve(estimate.covariance, error)))
         return float(np.mean(found[5:]))
 
-    wrong = longer(room.camera, share)
+    return off
+
+
+@pytest.mark.parametrize("share", [-0.005, 0.005])
+def test_another_cameras_focal_length_is_reckoned_with(
+    room: Room, extractor: FakeExtractor, share: float
+) -> None:
+    off, wrong = errors_of(room, extractor), longer(room.camera, share)
     assert off(0.0, wrong) > 60
     assert off(0.005, wrong) < 20
+
+
+def test_the_maps_own_focal_length_is_not_doubted(room: Room, extractor: FakeExtractor) -> None:
+    off = errors_of(room, extractor)
     assert off(0.005, room.camera) == off(0.0, room.camera) < 12

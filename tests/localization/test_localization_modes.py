@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from synthetic import all_compared, keyframes_of, landmarks_at, unit, unit_rows
 
 from ground_station.experiments.alter import scaled_camera
 from ground_station.features.extractor import Features
@@ -20,12 +21,6 @@ from ground_station.localization.retrieval import PlaceIndex
 from ground_station.localization.settings import AssociationSettings, load_preset
 from ground_station.localization.verification import Witness
 from ground_station.map.modes import Modes, described
-from ground_station.map.store import Keyframes
-
-
-def _unit(rng, count, dimension=64):
-    rows = rng.normal(size=(count, dimension))
-    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
 def _distances(features, landmarks, modes):
@@ -40,7 +35,7 @@ def _distances(features, landmarks, modes):
 def _modes(rng, landmarks, count, dimension=64):
     """Of random landmarks, up to three each; some are nearly what the landmark has already."""
     of = np.sort(np.repeat(rng.permutation(landmarks)[:count], rng.integers(1, 4, count)))
-    return of.astype(np.int32), _unit(rng, len(of), dimension)
+    return of.astype(np.int32), unit_rows(rng, len(of), dimension)
 
 
 @settings(deadline=None, max_examples=40)
@@ -52,47 +47,36 @@ def _modes(rng, landmarks, count, dimension=64):
 )
 def test_association_compares_landmarks_and_not_their_looks(seed, ratio, radius, dimension):
     rng = np.random.default_rng(seed)
-    ld = _unit(rng, 60, dimension)
+    ld = unit_rows(rng, 60, dimension)
     of, looks = _modes(rng, 60, 20, dimension)
     looks[::3] = ld[of[::3]] + 0.01 * looks[::3]  # nearly the same twice: never rivals
-    looks /= np.linalg.norm(looks, axis=1, keepdims=True)
-    modes = Modes(of, looks)
+    modes = Modes(of, unit(looks))
     lp = rng.uniform(0, 300, (60, 2))
     rows, mode = described(ld, modes, np.arange(60))
     shows = np.concatenate([np.arange(60), mode])
     own = rng.integers(0, len(rows), 50)
-    fd = rows[own] + rng.normal(0, 0.5 / np.sqrt(dimension), (50, dimension))
-    fd = (fd / np.linalg.norm(fd, axis=1, keepdims=True)).astype(np.float32)
+    fd = unit(rows[own] + rng.normal(0, 0.5 / np.sqrt(dimension), (50, dimension)))
     fp = lp[shows[own]] + rng.normal(0, 0.4 * radius, (50, 2))
     options = AssociationSettings(max_ratio=ratio)
     limit = rng.uniform(0.4, 0.9)
     found = associate(fp, fd, lp[shows], rows, options, radius, limit, shows=shows)
 
-    distance = _distances(fd, ld, modes)
-    there = np.linalg.norm(fp[:, None] - lp[None], axis=2) <= radius
-    distance[~there | (distance > limit / ratio)] = np.inf
-    best = {}
-    for i, row in enumerate(distance):
-        j = int(np.argmin(row))
-        wins = row[j] < limit and row[j] <= ratio * np.delete(row, j).min()
-        if wins and (j not in best or row[j] < best[j][0]):
-            best[j] = (row[j], i)
+    near = np.linalg.norm(fp[:, None] - lp[None], axis=2) <= radius
     pairs = list(zip(found.feature.tolist(), found.candidate.tolist(), strict=True))
-    assert pairs == sorted((i, j) for j, (_, i) in best.items())
+    assert pairs == all_compared(_distances(fd, ld, modes), near, limit, ratio)
 
 
 @pytest.mark.parametrize("ratio", [1.0, 0.8])
 def test_a_search_of_everything_compares_landmarks_and_not_their_looks(ratio):
     rng = np.random.default_rng(3)
-    ld = _unit(rng, 300)
+    ld = unit_rows(rng, 300)
     of, looks = _modes(rng, 300, 120)
     looks[::3] = ld[of[::3]]
     modes = Modes(of, looks)
     index = np.arange(300)
     rows, mode = described(ld, modes, index)
     own = rng.integers(0, len(rows), 200)
-    fd = rows[own] + rng.normal(0, 0.05, (200, 64)).astype(np.float32)
-    fd /= np.linalg.norm(fd, axis=1, keepdims=True)
+    fd = unit(rows[own] + rng.normal(0, 0.05, (200, 64)))
     feature, landmark = match_all(fd, rows, ratio, mode)
     distance = _distances(fd, ld, modes)
     expected = [
@@ -106,19 +90,14 @@ def test_a_search_of_everything_compares_landmarks_and_not_their_looks(ratio):
 
 def test_the_place_index_finds_landmarks_by_any_look_and_never_one_twice():
     rng = np.random.default_rng(4)
-    ld = _unit(rng, 500)
+    ld = unit_rows(rng, 500)
     of, looks = _modes(rng, 500, 200)
     modes = Modes(of, looks)
-    landmarks = _plain_landmarks(ld)
-    keyframes = Keyframes(
-        ["a"], np.zeros(1, np.int64), np.eye(4)[None], np.array([0, 500]),
-        np.arange(500, dtype=np.int32), np.zeros((500, 2), np.float32),
-    )  # fmt: skip
-    index = PlaceIndex(landmarks, keyframes, 0, modes)
+    landmarks = landmarks_at(np.zeros((500, 3)), ld)
+    index = PlaceIndex(landmarks, keyframes_of(np.eye(4)[None], [np.arange(500)]), 0, modes)
     rows, mode = described(ld, modes, np.arange(500))
     shows = np.concatenate([np.arange(500), mode])
-    fd = rows + 0.03 * rng.normal(size=rows.shape).astype(np.float32)
-    fd /= np.linalg.norm(fd, axis=1, keepdims=True)
+    fd = unit(rows + 0.03 * rng.normal(size=rows.shape))
     best, cosine = index.nearest(fd)
     assert (best[:, 0] == shows).mean() > 0.97
     found = cosine[:, 1] > -1
@@ -127,29 +106,12 @@ def test_the_place_index_finds_landmarks_by_any_look_and_never_one_twice():
     assert np.allclose(cosine[right, 0], np.sum(fd * rows, axis=1)[right], atol=1e-5)
 
 
-def _plain_landmarks(descriptor):
-    from ground_station.map.store import Landmarks
-
-    n = len(descriptor)
-    return Landmarks(
-        id=np.arange(n),
-        position_m=np.zeros((n, 3)),
-        covariance_m2=np.zeros((n, 3, 3), np.float32),
-        descriptor=descriptor,
-        spread=np.zeros(n, np.float32),
-        view_direction=np.zeros((n, 3), np.float32),
-        view_cos=np.zeros(n, np.float32),
-        distance_m=np.zeros((n, 2), np.float32),
-        observations=np.ones(n, np.int32),
-    )
-
-
 def _other_light(room, share=1.0):
     """The room's map with other looks of some landmarks, and what it looks like then."""
     lm = room.map.landmarks
     rng = np.random.default_rng(9)
     of = np.flatnonzero(rng.random(len(lm)) < share).astype(np.int32)
-    looks = _unit(rng, len(of))
+    looks = unit_rows(rng, len(of))
     then = np.array(lm.descriptor)
     then[of] = looks
     dark = replace(room, map=replace(room.map, landmarks=replace(lm, descriptor=then)))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
+from synthetic import NO_KEYFRAMES, apart, keyframes_of, unit_rows
 
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
@@ -20,7 +21,7 @@ from ground_station.localization.relocalization import (
 )
 from ground_station.localization.retrieval import PlaceIndex
 from ground_station.localization.settings import load_preset
-from ground_station.map.store import Keyframes, Landmarks, Map
+from ground_station.map.store import Landmarks, Map
 
 SETTINGS = load_preset("default").recovery
 
@@ -37,17 +38,7 @@ def observed(map_: Map, wTc: np.ndarray, most: int = 300) -> np.ndarray:
 
 def with_keyframes(map_: Map, wTc: np.ndarray) -> Map:
     """The map as if it had been made from frames at these poses (K, 4, 4)."""
-    seen = [observed(map_, pose) for pose in wTc]
-    total = int(sum(map(len, seen)))
-    keyframes = Keyframes(
-        names=[f"{k}" for k in range(len(seen))],
-        time_ns=np.arange(len(seen), dtype=np.int64),
-        wTc=wTc,
-        offset=np.r_[0, np.cumsum([len(s) for s in seen])].astype(np.int64),
-        landmark=np.concatenate(seen),
-        pixel_px=np.zeros((total, 2), np.float32),
-    )
-    return replace(map_, keyframes=keyframes)
+    return replace(map_, keyframes=keyframes_of(wTc, [observed(map_, pose) for pose in wTc]))
 
 
 def twice(map_: Map, aside_m: float) -> Map:
@@ -57,14 +48,8 @@ def twice(map_: Map, aside_m: float) -> Map:
     both["position_m"][len(lm) :] += [aside_m, 0, 0]
     wTc = kf.wTc.copy()
     wTc[:, :3, 3] += [aside_m, 0, 0]
-    keyframes = Keyframes(
-        names=kf.names * 2,
-        time_ns=np.concatenate([kf.time_ns] * 2),
-        wTc=np.concatenate([kf.wTc, wTc]),
-        offset=np.concatenate([kf.offset, kf.offset[1:] + kf.offset[-1]]),
-        landmark=np.concatenate([kf.landmark, kf.landmark + np.int32(len(lm))]),
-        pixel_px=np.concatenate([kf.pixel_px] * 2),
-    )
+    seen = np.split(kf.landmark, kf.offset[1:-1])
+    keyframes = keyframes_of(np.concatenate([kf.wTc, wTc]), [*seen, *(s + len(lm) for s in seen)])
     return replace(map_, landmarks=Landmarks(**both), keyframes=keyframes)
 
 
@@ -89,40 +74,33 @@ def find(map_: Map, features: Features) -> Relocalization | str:
     return found if isinstance(found, str) else relocalizer.alone(found)
 
 
-def apart(found: Relocalization | str, truth: np.ndarray) -> tuple[float, float]:
+def off_m(found: Relocalization | str, truth: np.ndarray) -> float:
     assert isinstance(found, Relocalization), found
-    difference = poses.inverse(truth) @ found.wTc
-    angle = float(np.degrees(poses.rotation_angle(difference[:3, :3])))
-    return float(np.linalg.norm(difference[:3, 3])), angle
+    return apart(found.wTc, truth)[0]
+
+
+def strangers(like: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """As many descriptors of what nobody has seen before."""
+    return unit_rows(rng, *like.shape)
 
 
 def test_the_right_place_is_found_among_sixty_percent_outliers(building):
     for wTc in building.path:
-        position_m, angle_deg = apart(find(building.map, building.features(wTc, outliers=0.6)), wTc)
-        assert position_m < 0.03 and angle_deg < 0.3
+        found = find(building.map, building.features(wTc, outliers=0.6))
+        assert off_m(found, wTc) < 0.03 and apart(found.wTc, wTc)[1] < np.radians(0.3)
 
 
 def test_without_keyframes_every_landmark_is_matched(building):
     wTc = building.path[2]
     features = building.features(wTc, outliers=0.6)
-    none = Keyframes(
-        names=[],
-        time_ns=np.empty(0, np.int64),
-        wTc=np.empty((0, 4, 4)),
-        offset=np.zeros(1, np.int64),
-        landmark=np.empty(0, np.int32),
-        pixel_px=np.empty((0, 2), np.float32),
-    )
-    assert apart(find(replace(building.map, keyframes=none), features), wTc)[0] < 0.03
+    assert off_m(find(replace(building.map, keyframes=NO_KEYFRAMES), features), wTc) < 0.03
 
 
 def test_a_frame_that_shares_nothing_with_the_map_is_refused(building):
     rng = np.random.default_rng(3)
     for wTc in building.path[:4]:
         features = building.features(wTc)
-        other = rng.normal(size=features.descriptors.shape)
-        other /= np.linalg.norm(other, axis=1, keepdims=True)
-        foreign = replace(features, descriptors=other.astype(np.float32))
+        foreign = replace(features, descriptors=strangers(features.descriptors, rng))
         assert isinstance(find(building.map, foreign), str)
     empty = Features(
         np.empty((0, 2), np.float32), np.empty(0, np.float32), features.descriptors[:0]
@@ -144,9 +122,7 @@ def test_one_known_poster_in_another_building_is_no_place(building):
         features = building.features(wTc, outliers=0.0)
         centre = np.median(features.keypoints_px, axis=0)
         known = np.linalg.norm(features.keypoints_px - centre, axis=1) < 80
-        rng = np.random.default_rng(5)
-        other = rng.normal(size=features.descriptors.shape).astype(np.float32)
-        other /= np.linalg.norm(other, axis=1, keepdims=True)
+        other = strangers(features.descriptors, np.random.default_rng(5))
         descriptors = np.where(known[:, None], features.descriptors, other)
         assert known.sum() >= 12
         assert isinstance(find(building.map, replace(features, descriptors=descriptors)), str)
@@ -166,7 +142,7 @@ def test_of_two_equal_places_both_are_named_for_who_knows_more(building):
     for wTc in building.path[:4]:
         seen = describe(building.features(wTc), THESIS_CAMERA, Conditions())
         found = relocalizer.candidates(seen)
-        assert len(found) > 1 and min(apart(one, wTc)[0] for one in found) < 0.03
+        assert len(found) > 1 and min(off_m(one, wTc) for one in found) < 0.03
         assert "fit alike" in relocalizer.alone(found)
 
 
@@ -175,14 +151,13 @@ def test_a_few_landmarks_are_named_but_not_believed_by_themselves(building):
     rng = np.random.default_rng(8)
     for wTc in building.path[:4]:
         features = building.features(wTc)
-        other = rng.normal(size=features.descriptors.shape)
-        other /= np.linalg.norm(other, axis=1, keepdims=True)
+        other = strangers(features.descriptors, rng)
         few = rng.permutation(len(features)) < 24
-        mixed = np.where(few[:, None], features.descriptors, other).astype(np.float32)
+        mixed = np.where(few[:, None], features.descriptors, other)
         faint = replace(features, descriptors=mixed)
         found = relocalizer.candidates(describe(faint, THESIS_CAMERA, Conditions()))
         assert not isinstance(found, str) and all(one.doubt for one in found)
-        assert apart(found[0], wTc)[0] < 0.1
+        assert off_m(found[0], wTc) < 0.1
         assert "landmarks where they should be" in str(relocalizer.alone(found))
 
 
@@ -204,10 +179,9 @@ def test_what_differs_between_two_alike_places_decides(building):
     rng = np.random.default_rng(6)
     own = double.landmarks.descriptor[len(building.map.landmarks) :]
     changed = rng.random(len(own)) < 0.6
-    other = rng.normal(size=own[changed].shape)
-    own[changed] = other / np.linalg.norm(other, axis=1, keepdims=True)
+    own[changed] = strangers(own[changed], rng)
     for wTc in building.path[:4]:
-        assert apart(find(double, building.features(wTc)), wTc)[0] < 0.03
+        assert off_m(find(double, building.features(wTc)), wTc) < 0.03
 
 
 def test_the_same_frame_and_seed_give_the_same_answer(building):

@@ -76,15 +76,14 @@ def through(smoother: FixedLagSmoother, run: Run) -> Iterator[tuple[Kinematics, 
         yield causal, smoother.smoothed()
 
 
-def nees(states: list[Kinematics], truth: dict[int, Kinematics]) -> np.ndarray:
-    errors = [(s, process.difference(s, truth[s.time_ns])) for s in states]
-    return np.array([e @ np.linalg.solve(s.covariance, e) for s, e in errors])
+def squared(a: Kinematics, b: Kinematics, covariance: np.ndarray) -> float:
+    """The Mahalanobis distance of two states, squared."""
+    gap = process.difference(a, b)
+    return float(gap @ np.linalg.solve(covariance, gap))
 
 
-def rms(states: list[Kinematics], truth: dict[int, Kinematics]) -> np.ndarray:
-    """Of rotation, position, turn rate and velocity."""
-    errors = [process.difference(s, truth[s.time_ns]) for s in states]
-    return np.sqrt((np.array(errors).reshape(-1, 4, 3) ** 2).mean((0, 2)))
+def nees(states: list[Kinematics], truth: dict[int, Kinematics]) -> list[float]:
+    return [squared(state, truth[state.time_ns], state.covariance) for state in states]
 
 
 def test_the_causal_state_is_that_of_an_extended_kalman_filter():
@@ -96,9 +95,8 @@ def test_the_causal_state_is_that_of_an_extended_kalman_filter():
     ):
         predicted = process.advance(state, time_ns, STEADY, density).state
         state = solve(predicted, measured).state
-        gap = process.difference(state, causal)
         # In standard deviations: what differs is where the two are made linear.
-        assert gap @ np.linalg.solve(state.covariance, gap) < 0.05**2
+        assert squared(state, causal, state.covariance) < 0.05**2
         sigma = np.sqrt(np.diag(state.covariance))
         assert np.sqrt(np.diag(causal.covariance)) == pytest.approx(sigma, rel=0.01)
 
@@ -159,30 +157,28 @@ def test_the_states_of_the_lag_are_those_of_a_batch_of_all_frames():
     ours = smoother.flush()
     assert [s.time_ns for s in ours] == [s.time_ns for s in states]
     for k, (smoothed, state, covariance) in enumerate(zip(ours, states, covariances, strict=True)):
-        gap = process.difference(state, smoothed)
         # The first two were far off when their factors were made linear.
-        assert gap @ np.linalg.solve(covariance, gap) < (0.15 if k < 2 else 0.05) ** 2
+        assert squared(state, smoothed, covariance) < (0.15 if k < 2 else 0.05) ** 2
         sigma = np.sqrt(np.diag(covariance))
         assert np.sqrt(np.diag(smoothed.covariance)) == pytest.approx(sigma, rel=0.02)
     assert smoother.latest is None and smoother.predict(10**12) is None
 
 
 def test_with_white_noise_both_estimates_know_their_errors_and_the_later_one_has_less():
-    causal, smoothed, truth = [], [], {}
+    causal, smoothed = [], []  # error and NEES of each state
     for seed in (3, 4):
         run = drawn(seed, 300)
-        # Each seed at times of its own, so that one table holds both.
         for state, left in through(FixedLagSmoother(STEADY), run):
-            causal.append(process.difference(state, run.truth[state.time_ns]))
-            truth.setdefault("causal", []).append(nees([state], run.truth)[0])
-            for later in left:
-                smoothed.append(process.difference(later, run.truth[later.time_ns]))
-                truth.setdefault("smoothed", []).append(nees([later], run.truth)[0])
-    # 12 degrees of freedom; neighbours in time are correlated, so the mean strays by about one.
-    assert 10.5 < np.mean(truth["causal"]) < 13.5
-    assert 10.5 < np.mean(truth["smoothed"]) < 13.5
-    error = [np.sqrt((np.array(e).reshape(-1, 4, 3) ** 2).mean((0, 2))) for e in (causal, smoothed)]
-    assert (error[1] < 0.75 * error[0]).all()
+            for told, states in ((causal, [state]), (smoothed, left)):
+                errors = [process.difference(s, run.truth[s.time_ns]) for s in states]
+                told += zip(errors, nees(states, run.truth), strict=True)
+    rms = []
+    for told in (causal, smoothed):
+        errors, consistency = zip(*told, strict=True)
+        # 12 degrees of freedom; neighbours in time are correlated: the mean strays by about one.
+        assert 10.5 < np.mean(consistency) < 13.5
+        rms.append(np.sqrt((np.array(errors).reshape(-1, 4, 3) ** 2).mean((0, 2))))
+    assert (rms[1] < 0.75 * rms[0]).all()
 
 
 def test_each_state_leaves_once_after_the_lag_and_used_later_frames():
@@ -214,8 +210,7 @@ def test_lost_frames_stretch_the_prediction_and_no_state_is_lost_in_a_gap():
     for time_ns, measured in keep:
         predicted = smoother.predict(time_ns)
         spans.append(np.sqrt(np.diag(predicted.covariance)[3:6]).max())
-        gap = process.difference(predicted, run.truth[time_ns])
-        assert gap @ np.linalg.solve(predicted.covariance, gap) < 50
+        assert squared(predicted, run.truth[time_ns], predicted.covariance) < 50
         smoother.update(solve(predicted, measured))
         left += smoother.smoothed()
     assert spans[40] > 5 * spans[39]
@@ -224,6 +219,16 @@ def test_lost_frames_stretch_the_prediction_and_no_state_is_lost_in_a_gap():
     assert [s.time_ns for s in left] == [run.start.time_ns] + [t for t, _ in keep]
     assert np.mean(nees(left, run.truth)) < 18
     assert smoother.failures == 0
+
+
+def after(seed: int, count: int) -> tuple[Run, FixedLagSmoother, Kinematics]:
+    """A run, what has smoothed it, and what that predicts of the frame after it."""
+    run, smoother = drawn(seed, count), FixedLagSmoother(STEADY)
+    for _ in through(smoother, run):
+        pass
+    predicted = smoother.predict(run.measured[-1][0] + FRAME_NS)
+    assert predicted is not None
+    return run, smoother, predicted
 
 
 NAN = np.full(12, np.nan)
@@ -240,11 +245,8 @@ HOSTILE = {
 @pytest.mark.parametrize("name", HOSTILE)
 @pytest.mark.parametrize("covariance", [START, np.diag(NAN), np.zeros((12, 12)), -START])
 def test_a_frame_that_no_filter_can_use_restarts_from_its_solution_and_says_so(name, covariance):
-    run, smoother = drawn(7, 30), FixedLagSmoother(STEADY)
-    for _ in through(smoother, run):
-        pass
-    time_ns = run.measured[-1][0] + FRAME_NS
-    solution = solve(smoother.predict(time_ns), run.measured[-1][1])
+    run, smoother, predicted = after(7, 30)
+    solution = solve(predicted, run.measured[-1][1])
     solution = replace(solution, state=replace(solution.state, covariance=covariance))
     given = solution.state
     state = smoother.update(replace(solution, **HOSTILE[name]))
@@ -257,7 +259,7 @@ def test_a_frame_that_no_filter_can_use_restarts_from_its_solution_and_says_so(n
     for smoothed in smoother.smoothed():
         assert np.abs(process.difference(smoothed, run.truth[smoothed.time_ns])[:6]).max() < 0.2
     for k in range(1, 40):
-        later_ns = time_ns + k * FRAME_NS
+        later_ns = predicted.time_ns + k * FRAME_NS
         truth = state.wTc @ poses.exp(state.twist * (k / 30))
         state_now = smoother.update(solve(smoother.predict(later_ns), truth))
     assert np.abs(poses.log(poses.inverse(truth) @ state_now.wTc)).max() < 0.05
@@ -266,11 +268,7 @@ def test_a_frame_that_no_filter_can_use_restarts_from_its_solution_and_says_so(n
 
 @pytest.mark.parametrize("what", ["wTc", "twist"])
 def test_a_solution_that_is_no_number_leaves_the_prediction(what):
-    run, smoother = drawn(8, 30), FixedLagSmoother(STEADY)
-    for _ in through(smoother, run):
-        pass
-    time_ns = run.measured[-1][0] + FRAME_NS
-    predicted = smoother.predict(time_ns)
+    run, smoother, predicted = after(8, 30)
     solution = solve(predicted, run.measured[-1][1])
     bad = replace(solution.state, **{what: getattr(solution.state, what) * np.nan})
     state = smoother.update(replace(solution, state=bad))
@@ -280,11 +278,7 @@ def test_a_solution_that_is_no_number_leaves_the_prediction(what):
 
 
 def test_a_frame_without_observations_says_what_the_prediction_says():
-    run, smoother = drawn(9, 40), FixedLagSmoother(STEADY)
-    for _ in through(smoother, run):
-        pass
-    time_ns = run.measured[-1][0] + FRAME_NS
-    predicted = smoother.predict(time_ns)
+    _, smoother, predicted = after(9, 40)
     none = Solution(predicted, np.zeros((12, 12)), np.zeros(12), np.zeros(0), np.zeros(0, bool))
     state = smoother.update(none)
     assert np.allclose(process.difference(predicted, state), 0, atol=1e-9)
@@ -359,8 +353,7 @@ def flown(plan: str, seed: int, settings: MotionSettings) -> tuple[list[float], 
                 twist = poses.log(poses.inverse(before[k + ahead]) @ behind[k + ahead]) / 2e-3
                 truth = Kinematics(times_ns[k + ahead], wTc[k + ahead], twist, wide)
                 expected = smoother.predict(truth.time_ns)
-                gap = process.difference(expected, truth)
-                distances.append(float(gap @ np.linalg.solve(expected.covariance, gap)))
+                distances.append(squared(expected, truth, expected.covariance))
     return distances, smoother
 
 

@@ -10,6 +10,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 import pytest
+from synthetic import NO_KEYFRAMES, apart, landmarks_at, preset_with
 
 from ground_station.features.methods.rootsift import RootSift
 from ground_station.geometry import poses
@@ -23,7 +24,7 @@ from ground_station.localization.matching import Matcher
 from ground_station.localization.settings import TrackingSettings, load_preset
 from ground_station.localization.tracking import Keyframe, evenly_lit, spread_out, track
 from ground_station.localization.worker import BESIDE_NICE, Worker
-from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo
+from ground_station.map.store import Map, MapInfo
 
 DEPTH_M = 4.0
 
@@ -75,29 +76,9 @@ class Wall:
         features = RootSift(1000).extract(self.picture(wTc))
         rays = np.c_[self.camera.undistort(features.keypoints_px), np.ones(len(features))]
         position = self.on_wall(rays, wTc)
-        n = len(position)
-        landmarks = Landmarks(
-            id=np.arange(n, dtype=np.int64),
-            position_m=position,
-            covariance_m2=np.tile(np.eye(3, dtype=np.float32) * 1e-4, (n, 1, 1)),
-            descriptor=features.descriptors,
-            spread=np.full(n, 0.1, np.float32),
-            view_direction=np.tile(np.array([0, 0, -1], np.float32), (n, 1)),
-            view_cos=np.full(n, 0.5, np.float32),
-            distance_m=np.tile(np.array([3, 6], np.float32), (n, 1)),
-            observations=np.full(n, 5, np.int32),
-        )
-        keyframes = Keyframes(
-            names=[],
-            time_ns=np.empty(0, np.int64),
-            wTc=np.empty((0, 4, 4)),
-            offset=np.zeros(1, np.int64),
-            landmark=np.empty(0, np.int32),
-            pixel_px=np.empty((0, 2), np.float32),
-        )
         sift = RootSift()
         info = MapInfo(sift.name, sift.sha256, 128, self.camera, "wall", "world", "m")
-        return Map(info, landmarks, keyframes)
+        return Map(info, landmarks_at(position, features.descriptors), NO_KEYFRAMES)
 
 
 @pytest.fixture(scope="module")
@@ -115,15 +96,12 @@ def path(count):
     return np.round(t * 1e9).astype(np.int64).tolist(), wTc
 
 
-def make(wall, sure_significance=None, **changes):
-    settings = load_preset("default")
-    if sure_significance is not None:
-        state = dataclasses.replace(settings.state, sure_significance=sure_significance)
-        settings = dataclasses.replace(settings, state=state)
-    tracking = dataclasses.replace(settings.tracking, **({"enabled": True} | changes))
-    settings = dataclasses.replace(settings, tracking=tracking)
+TIMES, TRUTH = path(60)
+
+
+def make(wall, **tables):
     extractor = Counting()
-    return Localizer(wall.map, wall.camera, extractor, settings), extractor
+    return Localizer(wall.map, wall.camera, extractor, preset_with(**tables)), extractor
 
 
 class Counting(RootSift):
@@ -138,15 +116,16 @@ class Counting(RootSift):
         return super().extract(image)
 
 
-def run(wall, count=24, **changes):
-    localizer, extractor = make(wall, **changes)
-    times, truth = path(count)
-    localizer.set_initial_pose(truth[0], times[0])
-    estimates = [
-        localizer.process(time_ns, wall.picture(wTc), k)
-        for k, (time_ns, wTc) in enumerate(zip(times, truth, strict=True))
-    ]
-    return estimates, truth, extractor
+def fly(localizer, wall, frames):
+    """What becomes of some frames of the way."""
+    return [localizer.process(TIMES[k], wall.picture(TRUTH[k]), k) for k in frames]
+
+
+def started(wall):
+    """A localizer that was told where it begins, and its extractor."""
+    localizer, extractor = make(wall)
+    localizer.set_initial_pose(TRUTH[0], TIMES[0])
+    return localizer, extractor
 
 
 @pytest.mark.parametrize(
@@ -186,14 +165,21 @@ def test_a_predictions_doubt_is_of_the_keyframes_own_points(wall):
     assert matcher.doubt_px(points[:0], expected) == 0.0
 
 
-def test_points_are_found_where_the_wall_says_they_are(wall):
+def followed(wall, wTc, predicted, picture):
+    """How far points are off where they were found again (N,), px, and how many were sought."""
     keyframe = wall.keyframe(np.eye(4))
-    wTc = poses.exp([0.02, -0.03, 0.04, 0.1, -0.05, 0.1])
-    predicted = wTc @ poses.exp([0.004, 0.004, 0.0, 0.01, 0.0, 0.0])
-    tracks = track(keyframe, wall.picture(wTc), predicted, wall.camera, TrackingSettings())
+    tracks = track(keyframe, picture, predicted, wall.camera, TrackingSettings())
     truth = wall.camera.project(poses.transform(poses.inverse(wTc), keyframe.points_m))
-    off = np.linalg.norm(tracks.pixel_px - truth[tracks.point], axis=1)
-    assert len(tracks.point) > 0.9 * tracks.sought > 100
+    return np.linalg.norm(tracks.pixel_px - truth[tracks.point], axis=1), tracks.sought
+
+
+ASIDE = poses.exp([0.02, -0.03, 0.04, 0.1, -0.05, 0.1])
+PREDICTED = ASIDE @ poses.exp([0.004, 0.004, 0.0, 0.01, 0.0, 0.0])
+
+
+def test_points_are_found_where_the_wall_says_they_are(wall):
+    off, sought = followed(wall, ASIDE, PREDICTED, wall.picture(ASIDE))
+    assert len(off) > 0.9 * sought > 100
     assert np.median(off) < 0.1 and np.percentile(off, 95) < 0.5
 
 
@@ -203,11 +189,9 @@ def test_points_are_found_where_the_wall_says_they_are(wall):
     ids=["nearer", "farther", "rolled", "aslant"],
 )
 def test_points_are_followed_where_the_wall_looks_otherwise(wall, moved):
-    keyframe, wTc = wall.keyframe(np.eye(4)), poses.exp(moved)
-    tracks = track(keyframe, wall.picture(wTc), wTc, wall.camera, TrackingSettings())
-    truth = wall.camera.project(poses.transform(poses.inverse(wTc), keyframe.points_m))
-    off = np.linalg.norm(tracks.pixel_px - truth[tracks.point], axis=1)
-    assert len(tracks.point) > 0.95 * tracks.sought > 80
+    wTc = poses.exp(moved)
+    off, sought = followed(wall, wTc, wTc, wall.picture(wTc))
+    assert len(off) > 0.95 * sought > 80
     assert np.median(off) < 0.06 and np.percentile(off, 95) < 0.3
 
 
@@ -282,14 +266,8 @@ def bands(share: float) -> np.ndarray:
     ids=["+1 EV", "-1 EV", "-2 EV", "lights off", "flicker", "strong flicker"],
 )
 def test_points_are_followed_into_another_light(wall, light):
-    keyframe = wall.keyframe(np.eye(4))
-    wTc = poses.exp([0.02, -0.03, 0.04, 0.1, -0.05, 0.1])
-    predicted = wTc @ poses.exp([0.004, 0.004, 0.0, 0.01, 0.0, 0.0])
-    picture = relit(wall.picture(wTc), light)
-    tracks = track(keyframe, picture, predicted, wall.camera, TrackingSettings())
-    truth = wall.camera.project(poses.transform(poses.inverse(wTc), keyframe.points_m))
-    off = np.linalg.norm(tracks.pixel_px - truth[tracks.point], axis=1)
-    assert len(tracks.point) > 0.9 * tracks.sought > 100
+    off, sought = followed(wall, ASIDE, PREDICTED, relit(wall.picture(ASIDE), light))
+    assert len(off) > 0.9 * sought > 100
     assert np.median(off) < 0.15 and np.percentile(off, 95) < 0.6
 
 
@@ -325,12 +303,12 @@ def test_points_are_kept_evenly_and_the_best_first():
 
 
 def test_frames_in_between_are_tracked_as_well_as_described_ones(wall):
-    estimates, truth, extractor = run(wall)
+    localizer, extractor = started(wall)
+    estimates = fly(localizer, wall, range(24))
     assert not estimates[0].tracked and all(e.tracked for e in estimates[1:])
-    for estimate, wTc in zip(estimates, truth, strict=True):
-        apart = poses.log(poses.inverse(wTc) @ estimate.wTc)
+    for estimate, wTc in zip(estimates, TRUTH, strict=False):
         assert estimate.state is State.TRACKING
-        assert np.linalg.norm(apart[3:]) < 0.01 and np.linalg.norm(apart[:3]) < 0.003
+        assert within(estimate, wTc)
     assert {"track", "pose", "total"} <= set(estimates[1].stage_ms)
     assert any("background" in e.stage_ms for e in estimates)
     assert estimates[5].counts.inliers == estimates[5].observations.inlier.sum()
@@ -341,23 +319,25 @@ def test_frames_in_between_are_tracked_as_well_as_described_ones(wall):
 
 
 def test_the_same_frames_give_the_same_poses_again(wall):
-    first, second = (run(wall)[0] for _ in range(2))
+    first, second = (fly(started(wall)[0], wall, range(24)) for _ in range(2))
     for a, b in zip(first, second, strict=True):
         assert np.array_equal(a.wTc, b.wTc) and np.array_equal(a.covariance, b.covariance)
 
 
 def test_neither_exposure_nor_light_nor_flicker_is_a_reason_to_lose_a_frame(wall):
-    localizer, _ = make(wall)
-    times, truth = path(40)
-    localizer.set_initial_pose(truth[0], times[0])
+    localizer, _ = started(wall)
     light = [2.0, 0.5, 1.0, 0.02, 1.0]  # of eight frames each
-    for k, (time_ns, wTc) in enumerate(zip(times, truth, strict=True)):
+    for k in range(40):
         flicker = np.roll(bands(0.4), 160 * k, axis=0)
-        picture = relit(wall.picture(wTc), light[k // 8] * flicker, seed=k)
-        estimate = localizer.process(time_ns, picture, k)
+        picture = relit(wall.picture(TRUTH[k]), light[k // 8] * flicker, seed=k)
+        estimate = localizer.process(TIMES[k], picture, k)
         assert estimate.state is State.TRACKING, (k, estimate.reason)
-        apart = poses.log(poses.inverse(wTc) @ estimate.wTc)
-        assert np.linalg.norm(apart[3:]) < 0.01 and np.linalg.norm(apart[:3]) < 0.003
+        assert within(estimate, TRUTH[k])
+
+
+def within(estimate, wTc):
+    metres, radians = apart(estimate.wTc, wTc)
+    return metres < 0.01 and radians < 0.003
 
 
 def a_hand() -> np.ndarray:
@@ -366,72 +346,67 @@ def a_hand() -> np.ndarray:
     return cv2.resize(coarse, (640, 480), interpolation=cv2.INTER_CUBIC)
 
 
-def after_eight_frames(wall):
-    """A localizer that tracks, its extractor, and the flight's times and poses."""
-    localizer, extractor = make(wall)
-    times, truth = path(12)
-    localizer.set_initial_pose(truth[0], times[0])
-    for k in range(8):
-        localizer.process(times[k], wall.picture(truth[k]), k)
-    return localizer, extractor, times, truth
+@pytest.fixture
+def tracking_it(wall):
+    """A localizer that has tracked for eight frames, and its extractor."""
+    localizer, extractor = started(wall)
+    fly(localizer, wall, range(8))
+    return localizer, extractor
 
 
-def test_a_black_frame_is_skipped_and_the_next_is_followed_again(wall):
-    localizer, extractor, times, truth = after_eight_frames(wall)
-    black = localizer.process(times[8], np.zeros((480, 640), np.uint8), 8)
+def test_a_black_frame_is_skipped_and_the_next_is_followed_again(wall, tracking_it):
+    localizer, extractor = tracking_it
+    black = localizer.process(TIMES[8], np.zeros((480, 640), np.uint8), 8)
     assert black.gated and not black.localized and black.state is State.DEGRADED
-    back = localizer.process(times[9], wall.picture(truth[9]), 9)
+    (back,) = fly(localizer, wall, [9])
     assert back.localized and back.tracked and back.state is State.DEGRADED
     assert extractor.threads.count(threading.current_thread().name) == 1
 
 
-def test_a_damaged_frame_is_followed_by_what_is_left_of_it(wall):
-    localizer, extractor, times, truth = after_eight_frames(wall)
-    image, noise = wall.picture(truth[8]), np.random.default_rng(1)
+def test_a_damaged_frame_is_followed_by_what_is_left_of_it(wall, tracking_it):
+    localizer, extractor = tracking_it
+    image, noise = wall.picture(TRUTH[8]), np.random.default_rng(1)
     image[240:] = noise.integers(0, 255, image[240:].shape)
-    part = localizer.process(times[8], image, 8, damaged=below(15))
+    part = localizer.process(TIMES[8], image, 8, damaged=below(15))
     assert part.localized and part.tracked and part.state is State.TRACKING
     assert (part.observations.pixel_px[:, 1] < 230).all()
-    assert np.linalg.norm(part.wTc[:3, 3] - truth[8][:3, 3]) < 0.01
+    assert np.linalg.norm(part.wTc[:3, 3] - TRUTH[8][:3, 3]) < 0.01
     # All of it gone: nothing is found, and nothing is looked for.
     described = len(extractor.threads)
-    gone = localizer.process(times[9], image, 9, damaged=below(0))
+    gone = localizer.process(TIMES[9], image, 9, damaged=below(0))
     assert not gone.localized and gone.state is State.DEGRADED
     assert len(extractor.threads) == described
 
 
 def test_a_place_is_found_in_whole_frames_only(wall):
     localizer, extractor = make(wall)
-    times, truth = path(12)
     for k in range(6):
-        seen = localizer.process(times[k], wall.picture(truth[k]), k, damaged=below(25))
+        seen = localizer.process(TIMES[k], wall.picture(TRUTH[k]), k, damaged=below(25))
         assert not seen.localized and seen.state is State.INITIALIZING
     assert extractor.threads == []
     # And the first of these is searched at once, as the first of a stream is.
-    whole = localizer.process(times[6], wall.picture(truth[6]), 6)
+    (whole,) = fly(localizer, wall, [6])
     assert whole.relocalized and extractor.threads == [threading.current_thread().name]
 
 
-def test_a_strange_frame_is_searched_beside_and_the_next_is_followed_again(wall):
-    localizer, extractor, times, truth = after_eight_frames(wall)
-    strange = localizer.process(times[8], a_hand(), 8)
+def test_a_strange_frame_is_searched_beside_and_the_next_is_followed_again(wall, tracking_it):
+    localizer, extractor = tracking_it
+    strange = localizer.process(TIMES[8], a_hand(), 8)
     assert not strange.localized and not strange.tracked and strange.state is State.DEGRADED
     assert "features" not in strange.stage_ms and "points found" in strange.reason
-    back = localizer.process(times[9], wall.picture(truth[9]), 9)
+    back, after = fly(localizer, wall, [9, 10])
     assert back.localized and back.tracked and back.state is State.DEGRADED
     assert back.reason.startswith("just recovered")
-    assert localizer.process(times[10], wall.picture(truth[10]), 10).state is State.TRACKING
+    assert after.state is State.TRACKING
     assert extractor.threads.count(threading.current_thread().name) == 1
 
 
 @pytest.mark.parametrize("covered", ["dark", "a hand"])
 def test_what_was_lost_is_found_beside_the_frames_and_after_the_dark_at_once(wall, covered):
-    localizer, extractor = make(wall)
-    times, truth = path(60)
-    localizer.set_initial_pose(truth[0], times[0])
+    localizer, extractor = started(wall)
     cover = np.zeros((480, 640), np.uint8) if covered == "dark" else a_hand()
-    pictures = [cover if 10 <= k < 27 else wall.picture(truth[k]) for k in range(60)]
-    frames = [localizer.process(times[k], pictures[k], k) for k in range(60)]
+    pictures = [cover if 10 <= k < 27 else wall.picture(TRUTH[k]) for k in range(60)]
+    frames = [localizer.process(TIMES[k], pictures[k], k) for k in range(60)]
     states = [frame.state for frame in frames]
     assert State.LOST not in states[:15] and set(states[22:27]) == {State.LOST}
     found = next(k for k in range(27, 60) if frames[k].localized)
@@ -440,7 +415,7 @@ def test_what_was_lost_is_found_beside_the_frames_and_after_the_dark_at_once(wal
     sure = states.index(State.TRACKING, 27)
     assert found <= sure < 54 and all(state is State.TRACKING for state in states[sure:])
     for k in range(found, 60):
-        assert np.linalg.norm(frames[k].wTc[:3, 3] - truth[k][:3, 3]) < 0.02
+        assert np.linalg.norm(frames[k].wTc[:3, 3] - TRUTH[k][:3, 3]) < 0.02
     here = extractor.threads.count(threading.current_thread().name)
     assert here == (2 if covered == "dark" else 1)
     described = {k for k, frame in enumerate(frames) if "features" in frame.stage_ms}
@@ -448,9 +423,8 @@ def test_what_was_lost_is_found_beside_the_frames_and_after_the_dark_at_once(wal
 
 
 def test_a_weak_relocalization_is_not_confirmed_by_its_own_points(wall):
-    localizer, _ = make(wall, sure_significance=1e9)
-    times, truth = path(14)
-    frames = [localizer.process(times[k], wall.picture(truth[k]), k) for k in range(14)]
+    localizer, _ = make(wall, state={"sure_significance": 1e9})
+    frames = fly(localizer, wall, range(14))
     assert frames[0].relocalized and all(frame.tracked for frame in frames[1:])
     landed = next(k for k, frame in enumerate(frames) if "background" in frame.stage_ms)
     assert landed >= 4
@@ -461,21 +435,15 @@ def test_a_weak_relocalization_is_not_confirmed_by_its_own_points(wall):
 
 def test_frames_far_apart_are_described_themselves(wall):
     localizer, extractor = make(wall)
-    times, truth = path(31)
-    frames = [localizer.process(times[k], wall.picture(truth[k]), k) for k in range(0, 31, 6)]
+    frames = fly(localizer, wall, range(0, 31, 6))
     assert all(frame.localized and not frame.tracked for frame in frames)
     assert len(extractor.threads) == len(frames)
 
 
 def test_a_time_that_jumps_back_is_refused_while_tracking(wall):
-    localizer, _ = make(wall)
-    times, truth = path(4)
-    localizer.set_initial_pose(truth[0], times[0])
-    for k in range(3):
-        localizer.process(times[k], wall.picture(truth[k]), k)
-    refused = localizer.process(times[1], wall.picture(truth[1]), 1)
+    *_, refused, after = fly(started(wall)[0], wall, [0, 1, 2, 1, 3])
     assert refused.reason.startswith("refused") and refused.wTc is None
-    assert localizer.process(times[3], wall.picture(truth[3]), 3).tracked
+    assert after.tracked
 
 
 def test_the_thread_beside_the_tracking_steps_aside():

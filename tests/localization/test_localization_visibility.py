@@ -6,27 +6,22 @@ import dataclasses
 
 import numpy as np
 import pytest
+from synthetic import keyframes_of, landmarks_at, unit_rows
 
 from ground_station.geometry import poses
 from ground_station.localization.settings import ProjectionSettings
 from ground_station.localization.visibility import Covisibility, LandmarkIndex, project
-from ground_station.map.store import Keyframes, Landmarks
+from ground_station.map.store import Landmarks
 
 
 def _building(rng: np.random.Generator, count: int, side_m: float) -> Landmarks:
-    direction = rng.normal(size=(count, 3)).astype(np.float32)
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    near = rng.uniform(0.5, 2, count)
-    return Landmarks(
-        id=np.arange(count),
-        position_m=rng.uniform(-0.5, 0.5, (count, 3)) * [side_m, side_m, 8.0],
-        covariance_m2=np.zeros((count, 3, 3), np.float32),
-        descriptor=np.zeros((count, 1), np.float32),
-        spread=np.zeros(count, np.float32),
+    direction, near = unit_rows(rng, count, 3), rng.uniform(0.5, 2, count)
+    return landmarks_at(
+        rng.uniform(-0.5, 0.5, (count, 3)) * [side_m, side_m, 8.0],
+        np.zeros((count, 1), np.float32),
         view_direction=direction,
         view_cos=np.full(count, 0.3, np.float32),
         distance_m=np.stack([near, near + rng.uniform(1, 6, count)], axis=1).astype(np.float32),
-        observations=np.full(count, 3, np.int32),
     )
 
 
@@ -80,16 +75,7 @@ def test_an_index_of_nothing_sees_nothing(room):
 
 def _keyframes(position_m, seen):
     """Keyframes at positions (K, 3) that all look along z, and the landmarks that each saw."""
-    wTc = np.tile(np.eye(4), (len(seen), 1, 1))
-    wTc[:, :3, 3] = position_m
-    return Keyframes(
-        names=[str(k) for k in range(len(seen))],
-        time_ns=np.arange(len(seen)),
-        wTc=wTc,
-        offset=np.r_[0, np.cumsum([len(s) for s in seen])].astype(np.int64),
-        landmark=np.concatenate(seen).astype(np.int32),
-        pixel_px=np.zeros((sum(len(s) for s in seen), 2), np.float32),
-    )
+    return keyframes_of(poses.pose(np.tile(np.eye(3), (len(seen), 1, 1)), position_m), seen)
 
 
 def test_behind_the_wall_is_what_no_covisible_keyframe_saw():

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from synthetic import apart, preset_with, unit_rows
 
 from ground_station.errors import InputError, MapError
 from ground_station.features.extractor import Features
@@ -14,55 +15,59 @@ from ground_station.localization.attempt import Conditions
 from ground_station.localization.estimate import State
 from ground_station.localization.localizer import LocalizationError, Localizer
 from ground_station.localization.matching import describe
-from ground_station.localization.settings import GateSettings, load_preset
+from ground_station.localization.settings import load_preset
 
 NOTHING = Features(
     np.empty((0, 2), np.float32), np.empty(0, np.float32), np.empty((0, 64), np.float32)
 )
 
 
-def make(room, extractor, preset="default", **tables):
-    settings = load_preset(preset)
-    for table, changes in tables.items():
-        changed = dataclasses.replace(getattr(settings, table), **changes)
-        settings = dataclasses.replace(settings, **{table: changed})
-    return Localizer(room.map, room.camera, extractor, settings)
+class Flight:
+    """A localizer in the room, and frames of one way round it."""
 
+    def __init__(self, room, extractor, preset="default", **tables):
+        self.localizer = Localizer(room.map, room.camera, extractor, preset_with(preset, **tables))
+        self.features, (self.times, self.path) = room.features, room.path(300)
 
-def errors(estimate, truth):
-    apart = poses.log(poses.inverse(truth) @ estimate.wTc)
-    return np.linalg.norm(apart[3:]), np.rad2deg(np.linalg.norm(apart[:3]))
+    def started(self):
+        """The same, told where it begins."""
+        self.localizer.set_initial_pose(self.path[0], int(self.times[0]))
+        return self
+
+    def frame(self, k, features=None):
+        """What becomes of a frame that sees what it should, or these features."""
+        if features is None:
+            features = self.features(self.path[k])
+        return self.localizer.process_features(int(self.times[k]), features)
+
+    def off_m(self, estimate, k):
+        return apart(estimate.wTc, self.path[k])[0]
 
 
 @pytest.mark.parametrize("preset", ["default", "thesis"])
 def test_a_sequence_is_tracked_within_centimetres(room, extractor, preset):
-    localizer = make(room, extractor, preset)
-    times, path = room.path(45)
-    guess = path[0] @ poses.exp([0.01, -0.01, 0.0, 0.03, 0.0, 0.02])
-    localizer.set_initial_pose(guess, int(times[0]))
+    flight = Flight(room, extractor, preset)
+    guess = flight.path[0] @ poses.exp([0.01, -0.01, 0.0, 0.03, 0.0, 0.02])
+    flight.localizer.set_initial_pose(guess, int(flight.times[0]))
     off = []
-    for time_ns, wTc in zip(times.tolist(), path, strict=True):
-        estimate = localizer.process_features(time_ns, room.features(wTc))
+    for k in range(45):
+        estimate = flight.frame(k)
         assert estimate.state is State.TRACKING, estimate.reason
-        off.append(errors(estimate, wTc))
+        off.append(apart(estimate.wTc, flight.path[k]))
         assert estimate.counts.inliers == estimate.observations.inlier.sum()
         assert estimate.counts.projected >= len(estimate.observations)
         assert {"projection", "association", "pose", "total"} <= set(estimate.stage_ms)
         assert (np.linalg.eigvalsh(estimate.covariance) > 0).all()
-    assert np.max(off, axis=0)[0] < 0.03 and np.max(off, axis=0)[1] < 0.5
-    rms = np.sqrt(np.square(off).mean(axis=0))
-    assert rms[0] < 0.015 and rms[1] < 0.2
+    assert (np.max(off, axis=0) < [0.03, np.radians(0.5)]).all()
+    assert (np.sqrt(np.square(off).mean(axis=0)) < [0.015, np.radians(0.2)]).all()
 
 
 def test_what_a_map_is_off_is_in_the_covariance_and_degrades_nothing(room, extractor):
-    times, path = room.path(2)
-    seen = room.features(path[0])
+    seen = room.features(room.path(1)[1][0])
 
     def of(preset, **registration):
         room.map.info.registration = registration
-        localizer = make(room, extractor, preset)
-        localizer.set_initial_pose(path[0], int(times[0]))
-        return localizer.process_features(int(times[0]), seen)
+        return Flight(room, extractor, preset).started().frame(0, seen)
 
     plain, bent = of("default"), of("default", sigma_m=0.5, sigma_deg=3.0)
     more = np.diag([np.radians(3.0) ** 2] * 3 + [0.25] * 3)
@@ -74,142 +79,111 @@ def test_what_a_map_is_off_is_in_the_covariance_and_degrades_nothing(room, extra
 
 
 def test_without_a_first_pose_it_finds_itself_and_is_sure(room, extractor):
-    localizer = make(room, extractor)
-    times, path = room.path(1)
-    first = localizer.process_features(int(times[0]), room.features(path[0]))
+    first = Flight(room, extractor).frame(0)
     assert first.relocalized and first.state is State.TRACKING
 
 
 def test_a_weak_find_waits_for_confirmation(room, extractor):
-    localizer = make(room, extractor, state={"sure_significance": 1e9})
-    times, path = room.path(3)
-    first = localizer.process_features(int(times[0]), room.features(path[0]))
+    flight = Flight(room, extractor, state={"sure_significance": 1e9})
+    first, second, third = (flight.frame(k) for k in range(3))
     assert first.localized and first.relocalized and first.state is State.DEGRADED
     assert "confirm" in first.reason
-    second = localizer.process_features(int(times[1]), room.features(path[1]))
     assert second.state is State.DEGRADED and "1 of 2 frames agree" in second.reason
-    third = localizer.process_features(int(times[2]), room.features(path[2]))
     assert third.state is State.TRACKING and not third.relocalized
-    assert errors(third, path[2])[0] < 0.02
+    assert flight.off_m(third, 2) < 0.02
 
 
 def test_the_thesis_preset_never_finds_itself(room, extractor):
-    localizer = make(room, extractor, "thesis")
-    times, path = room.path(2)
-    for time_ns, wTc in zip(times.tolist(), path, strict=True):
-        estimate = localizer.process_features(time_ns, room.features(wTc))
+    flight = Flight(room, extractor, "thesis")
+    for k in range(2):
+        estimate = flight.frame(k)
         assert not estimate.localized and estimate.state is State.INITIALIZING
         assert estimate.reason == "no first pose"
 
 
 def test_a_blackout_ends_in_lost_and_the_default_comes_back_elsewhere(room, extractor):
-    localizer = make(room, extractor)
-    times, path = room.path(300)
-    localizer.set_initial_pose(path[0], int(times[0]))
+    flight = Flight(room, extractor).started()
     for k in range(3):
-        localizer.process_features(int(times[k]), room.features(path[k]))
-    states = [localizer.process_features(int(times[k]), NOTHING).state for k in range(3, 30)]
+        flight.frame(k)
+    states = [flight.frame(k, NOTHING).state for k in range(3, 30)]
     assert states[0] is State.DEGRADED and states[-1] is State.LOST
     lost_from = states.index(State.LOST)
     assert all(state is State.LOST for state in states[lost_from:])
-    assert (times[3 + lost_from] - times[2]) / 1e9 == pytest.approx(0.3, abs=0.05)
-    back = localizer.process_features(int(times[250]), room.features(path[250]))
+    assert (flight.times[3 + lost_from] - flight.times[2]) / 1e9 == pytest.approx(0.3, abs=0.05)
+    back, _, after = (flight.frame(k) for k in (250, 251, 252))
     assert back.relocalized and back.state is State.TRACKING
-    localizer.process_features(int(times[251]), room.features(path[251]))
-    after = localizer.process_features(int(times[252]), room.features(path[252]))
-    assert after.state is State.TRACKING and errors(after, path[252])[0] < 0.02
+    assert after.state is State.TRACKING and flight.off_m(after, 252) < 0.02
 
 
 def test_the_thesis_preset_is_lost_at_the_first_failure_and_says_so(room, extractor):
-    localizer = make(room, extractor, "thesis")
-    times, path = room.path(200)
-    localizer.set_initial_pose(path[0], int(times[0]))
-    assert localizer.process_features(int(times[0]), room.features(path[0])).localized
-    failed = localizer.process_features(int(times[1]), NOTHING)
+    flight = Flight(room, extractor, "thesis").started()
+    assert flight.frame(0).localized
+    failed = flight.frame(1, NOTHING)
     assert failed.state is State.LOST and failed.wTc is None and failed.covariance is None
     assert failed.reason == "0 observations"
-    elsewhere = localizer.process_features(int(times[199]), room.features(path[199]))
+    elsewhere = flight.frame(199)
     assert elsewhere.state is State.LOST and not elsewhere.localized
 
 
 @pytest.mark.parametrize("preset", ["default", "thesis"])
 def test_frames_of_another_building_are_never_tracked(room, extractor, preset):
-    localizer = make(room, extractor, preset)
-    times, path = room.path(20)
-    localizer.set_initial_pose(path[0], int(times[0]))
-    rng = np.random.default_rng(99)
-    for time_ns in times.tolist():
-        descriptors = rng.normal(size=(500, 64))
-        descriptors /= np.linalg.norm(descriptors, axis=1, keepdims=True)
-        other = Features(
-            rng.uniform(0, [640, 480], (500, 2)).astype(np.float32),
-            np.ones(500, np.float32),
-            descriptors.astype(np.float32),
-        )
-        estimate = localizer.process_features(time_ns, other)
+    flight, rng = Flight(room, extractor, preset).started(), np.random.default_rng(99)
+    for k in range(20):
+        pixels = rng.uniform(0, [640, 480], (500, 2)).astype(np.float32)
+        other = Features(pixels, np.ones(500, np.float32), unit_rows(rng, 500))
+        estimate = flight.frame(k, other)
         assert not estimate.localized and estimate.state is not State.TRACKING
 
 
 def test_a_believed_pose_needs_most_of_its_own_observations(room, extractor):
-    times, path = room.path(1)
     for share, believed in ((0.35, True), (0.9, False)):
-        localizer = make(room, extractor, "thesis", pose={"min_inlier_share": share})
-        localizer.set_initial_pose(path[0], int(times[0]))
-        features = room.features(path[0], outliers=0.0)
+        flight = Flight(room, extractor, "thesis", pose={"min_inlier_share": share}).started()
+        features = room.features(flight.path[0], outliers=0.0)
         features.keypoints_px[::3] += [18.0, 18.0]
-        estimate = localizer.process_features(int(times[0]), features)
+        estimate = flight.frame(0, features)
         assert estimate.localized == believed, estimate.reason
     assert "inliers of" in estimate.reason and estimate.state is State.INITIALIZING
     assert len(estimate.observations) == 0
 
 
 def test_features_that_are_not_finite_are_left_out(room, extractor):
-    localizer = make(room, extractor)
-    times, path = room.path(2)
-    localizer.set_initial_pose(path[0], int(times[0]))
-    features = room.features(path[0])
+    flight = Flight(room, extractor).started()
+    features = room.features(flight.path[0])
     features.keypoints_px[::5] = np.nan
     features.descriptors[1::5] = np.inf
-    estimate = localizer.process_features(int(times[0]), features)
-    assert estimate.localized and errors(estimate, path[0])[0] < 0.02
+    estimate = flight.frame(0, features)
+    assert estimate.localized and flight.off_m(estimate, 0) < 0.02
     left = len(features) - len(features.keypoints_px[::5]) - len(features.descriptors[1::5])
     assert len(describe(features, room.camera, Conditions())) == left
     features.keypoints_px[:] = np.nan
-    assert not localizer.process_features(int(times[1]), features).localized
+    assert not flight.frame(1, features).localized
 
 
 def test_a_time_that_jumps_back_is_refused_and_changes_nothing(room, extractor):
-    localizer = make(room, extractor)
-    times, path = room.path(4)
-    localizer.set_initial_pose(path[0], int(times[0]))
-    for k in (0, 1, 2):
-        localizer.process_features(int(times[k]), room.features(path[k]))
-    for time_ns in (int(times[1]), int(times[2])):
-        refused = localizer.process_features(time_ns, room.features(path[1]))
+    flight = Flight(room, extractor).started()
+    for k in range(3):
+        flight.frame(k)
+    for k in (1, 2):
+        refused = flight.frame(k)
         assert refused.reason.startswith("refused") and refused.wTc is None
         assert refused.state is not State.TRACKING
-    estimate = localizer.process_features(int(times[3]), room.features(path[3]))
-    assert estimate.state is State.TRACKING
-    localizer.reset()
-    localizer.set_initial_pose(path[0], int(times[0]))
-    assert localizer.process_features(int(times[0]), room.features(path[0])).localized
+    assert flight.frame(3).state is State.TRACKING
+    flight.localizer.reset()
+    assert flight.started().frame(0).localized
 
 
 def test_a_dull_frame_is_gated_and_degrades_before_it_is_lost(room, extractor):
-    localizer = make(room, extractor, "thesis")
-    times, path = room.path(30)
-    localizer.set_initial_pose(path[0], int(times[0]))
-    localizer.process_features(int(times[0]), room.features(path[0]))
+    flight = Flight(room, extractor, "thesis").started()
+    flight.frame(0)
     grey = np.full((480, 640), 128, np.uint8)
-    first = localizer.process(int(times[1]), grey, 1)
+    first, late = (flight.localizer.process(int(flight.times[k]), grey, k) for k in (1, 29))
     assert first.gated and first.wTc is None and first.state is State.DEGRADED
     assert first.reason == "entropy 0.00 below 7 bits"
-    late = localizer.process(int(times[29]), grey, 29)
     assert late.gated and late.state is State.LOST
 
 
 def test_a_frame_of_another_size_is_refused_by_name(room, extractor):
-    localizer = make(room, extractor)
+    localizer = Flight(room, extractor).localizer
     with pytest.raises(InputError, match="frame 5 has 320x240 pixels, the camera 640x480"):
         localizer.process(0, np.zeros((240, 320), np.uint8), 5)
 
@@ -217,11 +191,11 @@ def test_a_frame_of_another_size_is_refused_by_name(room, extractor):
 def test_a_map_of_other_features_is_refused_by_name(room, extractor):
     room.map.info.features_sha256 = "1" * 64
     with pytest.raises(MapError, match="built with 'synthetic'"):
-        make(room, extractor)
+        Flight(room, extractor)
 
 
 def test_a_first_pose_that_is_no_rigid_motion_is_refused(room, extractor):
-    localizer = make(room, extractor)
+    localizer = Flight(room, extractor).localizer
     for bad in (np.full((4, 4), np.nan), np.diag([2.0, 1, 1, 1]), np.diag([-1.0, 1, 1, 1])):
         with pytest.raises(LocalizationError, match="initial pose"):
             localizer.set_initial_pose(bad, 0)
@@ -231,52 +205,42 @@ def test_an_empty_map_localizes_nothing(room, extractor):
     landmarks = room.map.landmarks
     for field in dataclasses.fields(landmarks):
         setattr(landmarks, field.name, getattr(landmarks, field.name)[:0])
-    localizer = make(room, extractor)
-    localizer.set_initial_pose(np.eye(4), 0)
-    features = NOTHING
-    assert not localizer.process_features(1, features).localized
-    assert GateSettings().min_entropy_bits == 0.0
+    assert not Flight(room, extractor).started().frame(1, NOTHING).localized
 
 
 def test_what_the_prediction_misses_is_found_in_the_same_frame(room, extractor):
     """At a few frames a second the direction changes between two of them."""
-    localizer = make(room, extractor)
-    _, path = room.path(200)
-    order = [0, 20, 10, 60, 30, 90, 150]
-    for n, k in enumerate(order):
-        found = localizer.process_features(n * 500_000_000, room.features(path[k]))
+    flight = Flight(room, extractor)
+    for n, k in enumerate([0, 20, 10, 60, 30, 90, 150]):
+        found = flight.localizer.process_features(n * 500_000_000, room.features(flight.path[k]))
         assert found.localized and found.state is State.TRACKING
-        assert errors(found, path[k])[0] < 0.02
+        assert flight.off_m(found, k) < 0.02
 
 
 def test_a_turn_that_nothing_foretold_is_no_new_beginning(room, extractor):
     """A find that a wild camera may have reached keeps the motion known so far and adds to it."""
-    localizer = make(room, extractor)
+    localizer = Flight(room, extractor).localizer
     _, path = room.path(30, rate_hz=10.0)
     turned = poses.exp([0.0, np.deg2rad(6.0), 0.0, 0.0, 0.0, 0.0])
     for k in range(30):
         wTc = path[k] @ turned if k == 20 else path[k]
         found = localizer.process_features(k * 100_000_000, room.features(wTc))
-        assert found.localized and errors(found, wTc)[0] < 0.02
+        assert found.localized and apart(found.wTc, wTc)[0] < 0.02
         assert found.state is State.TRACKING and found.relocalized == (k == 0)
 
 
 def test_a_find_that_the_camera_cannot_have_reached_waits_for_confirmation(room, extractor):
-    localizer = make(room, extractor)
-    times, path = room.path(300)
-    localizer.set_initial_pose(path[0], int(times[0]))
+    flight = Flight(room, extractor).started()
     for k in range(3):
-        localizer.process_features(int(times[k]), room.features(path[k]))
-    there = localizer.process_features(int(times[3]), room.features(path[250]))
+        flight.frame(k)
+    there = flight.frame(3, room.features(flight.path[250]))
     assert there.localized and there.relocalized and there.state is State.DEGRADED
     assert "to be confirmed" in there.reason
 
 
 @pytest.mark.parametrize("units", [0.05, 0.5, 2.0, 30.0])
 def test_a_map_without_units_localizes_as_one_in_metres(room, extractor, units):
-    lm, kf = room.map.landmarks, room.map.keyframes
-    wTc = kf.wTc.copy()
-    wTc[:, :3, 3] *= units
+    lm = room.map.landmarks
     scaled = dataclasses.replace(
         room.map,
         info=dataclasses.replace(room.map.info, frame="map"),
@@ -286,7 +250,6 @@ def test_a_map_without_units_localizes_as_one_in_metres(room, extractor, units):
             covariance_m2=lm.covariance_m2 * np.float32(units**2),
             distance_m=lm.distance_m * np.float32(units),
         ),
-        keyframes=dataclasses.replace(kf, wTc=wTc),
     )
     localizer = Localizer(scaled, room.camera, extractor, load_preset("default"))
     times, path = room.path(20, rate_hz=10.0)

@@ -7,6 +7,8 @@ import sys
 from types import FunctionType, ModuleType
 
 import numpy as np
+import pytest
+from synthetic import FakeExtractor
 
 from ground_station.features.extractor import Features
 from ground_station.localization.estimate import State
@@ -18,10 +20,8 @@ ROUND = 45
 """Frames of a round: longer than the smoother's lag, and than any of the windows."""
 
 
-class Standing:
+class Standing(FakeExtractor):
     """A camera at rest before a patterned wall, whose lens is covered now and then."""
-
-    name, sha256, dimension, distance_scale = "synthetic", "0" * 64, 64, 1.0
 
     def __init__(self, room, wTc: np.ndarray) -> None:
         self.seen = room.features(wTc)
@@ -55,8 +55,12 @@ def fly(localizer: Localizer, camera: Standing, frames: range) -> list[State]:
     return states
 
 
-def test_what_a_localizer_holds_does_not_grow_with_its_stream(room):
-    camera = Standing(room, room.path(1)[1][0])
+@pytest.fixture
+def camera(room) -> Standing:
+    return Standing(room, room.path(1)[1][0])
+
+
+def test_what_a_localizer_holds_does_not_grow_with_its_stream(room, camera):
     localizer = Localizer(room.map, room.camera, camera, load_preset("default"))
     states = fly(localizer, camera, range(ROUND))
     assert {State.TRACKING, State.LOST} <= set(states)
@@ -69,8 +73,7 @@ def test_what_a_localizer_holds_does_not_grow_with_its_stream(room):
     assert localizer.smoothed() == localizer.finish() == []
 
 
-def test_who_asks_for_smoothed_poses_gets_each_once(room):
-    camera = Standing(room, room.path(1)[1][0])
+def test_who_asks_for_smoothed_poses_gets_each_once(room, camera):
     localizer = Localizer(room.map, room.camera, camera, load_preset("default"), smoothing=True)
     fly(localizer, camera, range(ROUND - 12))
     smoothed = [*localizer.smoothed(), *localizer.finish()]
@@ -78,8 +81,7 @@ def test_who_asks_for_smoothed_poses_gets_each_once(room):
     assert times == sorted(set(times)) and len(times) >= ROUND - 14
 
 
-def test_a_frame_that_is_sought_says_why_the_last_search_was_refused(room):
-    camera = Standing(room, room.path(1)[1][0])
+def test_a_frame_that_is_sought_says_why_the_last_search_was_refused(room, camera):
     localizer = Localizer(room.map, room.camera, camera, load_preset("default"))
     other = np.random.default_rng(4).permutation(camera.seen.descriptors)  # of another building
     camera.seen = Features(camera.seen.keypoints_px, camera.seen.scores, other)
