@@ -5,6 +5,9 @@ import socket
 import sys
 import threading
 import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 
 import cv2
@@ -154,62 +157,54 @@ def test_where_a_live_stream_comes_in(uri: str, where: tuple[str, int] | None) -
         assert parse_uri(uri) == where
 
 
-def test_a_live_stream_gives_frames_with_their_capture_times() -> None:
+@pytest.fixture
+def port() -> int:
+    """Of UDP, one that nobody listens at."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
-    datagrams = packets([stamped(unit, k) for k, unit in enumerate(encoded(6))])
+        return int(taken.getsockname()[1])
+
+
+@contextmanager
+def sending(port: int, datagrams_from: Callable[[int], list[bytes]]) -> Iterator[None]:
+    """Sends what is made with a sequence number, again and again: until somebody listens."""
     stop = threading.Event()
 
     def send() -> None:
+        number = 0
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            while not stop.wait(0.02):  # until somebody listens
+            while not stop.wait(0.02):
+                datagrams = datagrams_from(number)
+                number += len(datagrams)
                 for datagram in datagrams:
                     sender.sendto(datagram, ("127.0.0.1", port))
 
     thread = threading.Thread(target=send)
     thread.start()
     try:
-        frames = []
-        for frame in LiveFrames(f"udp://127.0.0.1:{port}", 20.0):
-            frames.append(frame)
-            if len(frames) == 3:
-                break
+        yield
     finally:
         stop.set()
         thread.join()
+
+
+def test_a_live_stream_gives_frames_with_their_capture_times(port: int) -> None:
+    datagrams = packets([stamped(unit, k) for k, unit in enumerate(encoded(6))])
+    with sending(port, lambda _: datagrams):
+        frames = list(islice(LiveFrames(f"udp://127.0.0.1:{port}", 20.0), 3))
     assert all(frame.time_ns in {capture_ns(k) for k in range(6)} for frame in frames)
     assert all(frame.image.shape == (480, 640) for frame in frames)
 
 
-def test_a_stream_that_cannot_be_shown_says_why() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
-    stop = threading.Event()
-
-    def send() -> None:
-        number = 0
-        unit = stamped(encoded(2)[1], 1)  # refers to what came before, and has no parameter sets
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            while not stop.wait(0.05):
-                for datagram in packets([unit], first=number):
-                    sender.sendto(datagram, ("127.0.0.1", port))
-                    number += 1
-
-    thread = threading.Thread(target=send)
-    thread.start()
-    try:
-        with pytest.raises(InputError, match=f":{port}: .*no parameter sets"):
-            list(LiveFrames(f"udp://127.0.0.1:{port}", 60.0))
-    finally:
-        stop.set()
-        thread.join()
+def test_a_stream_that_cannot_be_shown_says_why(port: int) -> None:
+    unit = stamped(encoded(2)[1], 1)  # refers to what came before, and has no parameter sets
+    with (
+        sending(port, lambda number: packets([unit], first=number)),
+        pytest.raises(InputError, match=f":{port}: .*no parameter sets"),
+    ):
+        list(LiveFrames(f"udp://127.0.0.1:{port}", 60.0))
 
 
-def test_a_silent_port_is_said() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        port = taken.getsockname()[1]
+def test_a_silent_port_is_said(port: int) -> None:
     with pytest.raises(InputError, match=f":{port}: no video came within"):
         list(LiveFrames(f"udp://127.0.0.1:{port}", 0.2))
