@@ -63,16 +63,12 @@ def test_of_equal_scores_one_is_kept_and_none_is_forgotten(levels):
     rows, columns = detection.strongest(
         scores, radius_px=radius, threshold=0.3, border_px=0, most=10_000
     )
-    kept = np.zeros_like(scores)
+    kept, covered = np.zeros_like(scores, bool), np.zeros_like(scores)
     for row, column in zip(rows, columns, strict=True):
         window = np.s_[max(0, row - radius) : row + radius + 1,
                        max(0, column - radius) : column + radius + 1]  # fmt: skip
-        assert not (kept[row, column] or (kept[window] == -1).any())
-        kept[row, column] = -1
-    covered = np.zeros_like(scores)
-    for row, column in zip(rows, columns, strict=True):
-        window = np.s_[max(0, row - radius) : row + radius + 1,
-                       max(0, column - radius) : column + radius + 1]  # fmt: skip
+        assert not kept[window].any()
+        kept[row, column] = True
         covered[window] = np.maximum(covered[window], scores[row, column])
     assert (covered >= np.where(scores > 0.3, scores, 0)).all()
 

@@ -219,7 +219,7 @@ def test_flipped_bytes_are_read_or_refused_in_one_line(path):
     """Nothing but `FeatureError` comes of a damaged file, whatever onnx makes of it."""
     whole, rng = path.read_bytes(), np.random.default_rng(0)
     refusals = 0
-    for _ in range(500):
+    for _ in range(250):
         broken = bytearray(whole)
         for place in rng.integers(0, len(whole), 3):
             broken[place] ^= 1 << rng.integers(0, 8)
@@ -230,4 +230,4 @@ def test_flipped_bytes_are_read_or_refused_in_one_line(path):
             refusals += 1
             assert "\n" not in str(error) and len(str(error)) < 500
     # Most of the file is weights, of which any value is one.
-    assert 20 < refusals < 500
+    assert 10 < refusals < 250

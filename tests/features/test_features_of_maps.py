@@ -19,6 +19,16 @@ from ground_station.mapping.construction import images, verification
 from ground_station.mapping.settings import MappingSettings
 from ground_station.recording.frames import Frame
 
+CAMERA = replace(THESIS_CAMERA, width_px=96, height_px=64)
+
+
+def frames_of_noise(count: int) -> list[Frame]:
+    rng = np.random.default_rng(0)
+    return [
+        Frame(k, f"{k}.png", k * 10**8, rng.integers(0, 256, (64, 96), dtype=np.uint8))
+        for k in range(count)
+    ]
+
 
 @pytest.fixture
 def bird(tmp_path, monkeypatch):
@@ -62,16 +72,13 @@ def test_a_map_of_a_model_that_is_not_here_is_refused_with_those_that_are(bird, 
 
 
 def test_a_map_is_built_with_a_model_by_name_on_several_threads(bird):
-    rng = np.random.default_rng(0)
-    camera = replace(THESIS_CAMERA, width_px=96, height_px=64)
-    pictures = [rng.integers(0, 256, (64, 96), dtype=np.uint8) for _ in range(5)]
-    frames = [Frame(k, f"{k}.png", k * 10**8, picture) for k, picture in enumerate(pictures)]
+    frames = frames_of_noise(5)
     settings = MappingSettings(features="bird", max_features=50)
-    found = images.extract(frames, camera, settings, 2, 5)
+    found = images.extract(frames, CAMERA, settings, 2, 5)
     alone = extractors.create("bird", 50)
-    for picture, features in zip(pictures, found.features, strict=True):
+    for frame, features in zip(frames, found.features, strict=True):
         assert features.descriptors.shape[1] == 16 and len(features) > 10
-        assert np.array_equal(features.keypoints_px, alone.extract(picture).keypoints_px)
+        assert np.array_equal(features.keypoints_px, alone.extract(frame.image).keypoints_px)
 
 
 def test_ratio_and_pairs_are_rootsifts_and_other_features_have_their_own(bird, monkeypatch):
@@ -88,15 +95,11 @@ def test_ratio_and_pairs_are_rootsifts_and_other_features_have_their_own(bird, m
 
     monkeypatch.setattr(verification, "mutual_matches", matches)
     monkeypatch.setattr(verification.choice, "choose_pairs", chosen)
-    rng = np.random.default_rng(0)
-    camera = replace(THESIS_CAMERA, width_px=96, height_px=64)
-    pictures = [rng.integers(0, 256, (64, 96), dtype=np.uint8) for _ in range(2)]
-    frames = [Frame(k, f"{k}.png", k * 10**8, picture) for k, picture in enumerate(pictures)]
     for name in ("rootsift", "bird"):
         settings = MappingSettings(features=name, max_features=50)
-        found = images.extract(frames, camera, settings, 1, 2)
+        found = images.extract(frames_of_noise(2), CAMERA, settings, 1, 2)
         with pytest.raises(MapError, match="no two of the 2 images overlap"):
-            verification.match(found, camera, settings, 1)
+            verification.match(found, CAMERA, settings, 1)
     wanted = settings.match
     assert ratios == [wanted.ratio, wanted.ratio_others] == [0.8, 0.95]
     assert similar == [wanted.similar, wanted.similar_others] == [8, 20]
