@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from ground_station.simulator import lighting, textures
+from ground_station.simulator import command, lighting, textures
 from ground_station.simulator.simulate import SimulationSettings
 
 
@@ -29,3 +30,15 @@ def quick_settings(out: Path, **changes: object) -> SimulationSettings:
         "texels_per_m": 12.0, "supersampling": 0.5, "renders": 1,
     }  # fmt: skip
     return SimulationSettings(**(values | changes))  # type: ignore[arg-type]
+
+
+def arguments(*words: str) -> argparse.Namespace:
+    """What `blimp simulate` is told."""
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    return parser.parse_args(words)
+
+
+def asked_for(*words: str) -> SimulationSettings:
+    """The settings that these words make."""
+    return command.settings_from(arguments("--out", "f.mcap", *words))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quick_flight import quick_settings
 
 from ground_station.arrays import F64
 from ground_station.geometry import poses
@@ -15,7 +16,6 @@ from ground_station.simulator import board
 from ground_station.simulator.plans import PHONE_CAMERA, WIDE_CAMERA
 from ground_station.simulator.scene import SimulatorError
 from ground_station.simulator.simulate import prepare_flight
-from tests.simulator.conftest import quick_settings
 
 FISHEYE = Camera(width_px=640, height_px=480, fx_px=230.0, fy_px=230.0, cx_px=319.0, cy_px=241.0,
                  model="fisheye", k1=-0.02)  # fmt: skip

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
+from quick_flight import asked_for, quick_settings
 
 from ground_station.arrays import F64
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.recording.flight import camera_of
-from ground_station.simulator import command, scenes
+from ground_station.simulator import scenes
 from ground_station.simulator.hall import PANEL_M, ROW_M
 from ground_station.simulator.imaging import covering_pinhole
 from ground_station.simulator.lighting import surface_albedo
@@ -26,7 +26,6 @@ from ground_station.simulator.simulate import (
 )
 from ground_station.simulator.textures import TextureBank
 from pi_firmware.wire.recording import FRAME_INFO_TOPIC, RecordingReader
-from tests.simulator.conftest import quick_settings
 from tests.simulator.test_simulator_scenes import nearest_surface_m
 
 SEEDS = range(6)
@@ -175,11 +174,7 @@ def test_the_command_takes_a_lens_from_a_file(tmp_path: Path) -> None:
     lens = tmp_path / "lens.toml"
     lens.write_text("width_px = 320\nheight_px = 240\nfx_px = 200.0\nfy_px = 200.0\n"
                     "cx_px = 159.5\ncy_px = 119.5\nk1 = -0.1\n")  # fmt: skip
-    parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
-    settings = command.settings_from(
-        parser.parse_args(["--out", "f.mcap", "--camera", str(lens), "--lens-error", "-0.02"])
-    )
+    settings = asked_for("--camera", str(lens), "--lens-error", "-0.02")
     assert settings.camera == Camera(320, 240, 200.0, 200.0, 159.5, 119.5, k1=-0.1)
     assert prepare_flight(settings).carried.fx_px == pytest.approx(196.0)
-    assert command.settings_from(parser.parse_args(["--out", "f.mcap"])).camera is None
+    assert asked_for().camera is None

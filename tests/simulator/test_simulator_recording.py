@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import signal
@@ -15,10 +14,12 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from quick_flight import arguments, asked_for, quick_settings
 
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.geometry.trajectory import read_tum
+from ground_station.recording.open import open_input
 from ground_station.simulator import command, scenes
 from ground_station.simulator.known_points import project_rolling
 from ground_station.simulator.sample import write_floorplan
@@ -29,7 +30,6 @@ from pi_firmware.wire.recording import (
     TRUTH_TOPIC,
     RecordingReader,
 )
-from tests.simulator.conftest import quick_settings
 
 
 def pictures(path: Path) -> list[np.ndarray]:
@@ -211,10 +211,8 @@ def test_the_command_parses_without_loading_anything_heavy() -> None:
 def test_the_command_writes_the_recording_and_its_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
     out, report = tmp_path / "f.mcap", tmp_path / "f.json"
-    args = parser.parse_args(["--out", str(out), "--json", str(report), "--seed", "5"])
+    args = arguments("--out", str(out), "--json", str(report), "--seed", "5")
     monkeypatch.setattr(command, "settings_from", lambda a: quick_settings(a.out, duration_s=0.2))
     assert command.run(args) == 0
     document = json.loads(report.read_text())
@@ -222,7 +220,7 @@ def test_the_command_writes_the_recording_and_its_json(
     assert document["bytes"] == out.stat().st_size
     assert "1 frames" in capsys.readouterr().out
     with pytest.raises(SimulatorError, match="--out is missing"):
-        command.run(parser.parse_args([]))
+        command.run(arguments())
 
 
 def test_the_floor_plan_is_what_map_server_reads(tmp_path: Path) -> None:
@@ -250,11 +248,8 @@ def test_the_floor_plan_is_what_map_server_reads(tmp_path: Path) -> None:
 
 
 def test_unsteady_light_and_exposure_are_shown_and_told(tmp_path: Path) -> None:
-    parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
     given = "--exposure-steps 0.2:1,0.4:-1 --light-steps 0.5:0.01 --flicker 0.5"
-    args = parser.parse_args(["--out", "f.mcap", *given.split(), "--longest-exposure-s", "0.002"])
-    asked = command.settings_from(args)
+    asked = asked_for(*given.split(), "--longest-exposure-s", "0.002")
     names = ("exposure_steps", "light_steps", "flicker", "longest_exposure_s")
     out = tmp_path / "f.mcap"
     simulate(quick_settings(out, **{name: getattr(asked, name) for name in names}))
@@ -274,13 +269,8 @@ def test_unsteady_light_and_exposure_are_shown_and_told(tmp_path: Path) -> None:
 def test_a_cameras_processing_is_named_and_changes_pictures_only(
     flight: Path, tmp_path: Path
 ) -> None:
-    parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
-    asked = command.settings_from(
-        parser.parse_args(["--out", "f.mcap", "--processing", "camera"])
-    ).processing
     out = tmp_path / "f.mcap"
-    simulate(quick_settings(out, processing=asked))
+    simulate(quick_settings(out, processing=asked_for("--processing", "camera").processing))
     plain, processed = RecordingReader(flight), RecordingReader(out)
     assert processed.poses(TRUTH_TOPIC) == plain.poses(TRUTH_TOPIC)
     assert [s.data for s in processed.video()] != [s.data for s in plain.video()]
@@ -308,3 +298,16 @@ def test_the_light_changes_colour_contrast_and_exposure(flight: Path, tmp_path: 
 
     assert warmth(sunset_picture) > 1.15 * warmth(noon_picture)
     assert light_taken(sunset) > 2 * light_taken(flight)
+
+
+def test_people_are_seen_and_move_and_nothing_else_changes(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "crowded.mcap"
+    simulate(quick_settings(out, people=30))
+    empty, crowded = (
+        [frame.image.astype(int) for frame in open_input(path)] for path in (flight, out)
+    )
+    changed = [np.abs(a - b) > 40 for a, b in zip(empty, crowded, strict=True)]
+    # They hide some of the picture, and of what lies above their heads nothing.
+    assert all(0.002 < one.mean() < 0.4 for one in changed)
+    assert not any(one[:100].any() for one in changed)
+    assert (changed[0] != changed[-1]).mean() > 0.002

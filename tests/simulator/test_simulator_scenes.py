@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from quick_flight import quick_settings
 
 from ground_station.recording.open import open_input
 from ground_station.simulator import scenes
@@ -16,7 +17,6 @@ from ground_station.simulator.rendering import Pinhole, SceneRenderer
 from ground_station.simulator.scene import Scene, SimulatorError
 from ground_station.simulator.simulate import simulate
 from ground_station.simulator.textures import TextureBank
-from tests.simulator.conftest import quick_settings
 
 HULL_M = 0.35
 """Half the blimp's width and what a draught adds."""
