@@ -8,7 +8,7 @@ import pytest
 
 from ground_station.feature_models import degrade, images
 from ground_station.features.extractor import FeatureError
-from ground_station.simulator import lighting, scenes
+from ground_station.simulator import lighting, scenes, textures
 from ground_station.simulator.textures import power_law_field
 from ground_station.training import rooms
 
@@ -102,12 +102,13 @@ def test_rooms_are_by_chance_and_none_is_one_that_localizers_are_judged_in():
     assert first.size_m != second.size_m
     assert rooms.build_room(1, 0).texture_seed == first.texture_seed
     for name in scenes.SCENES:
-        judged = scenes.build(name, 20)
+        judged = scenes.build(name, 10)
         for room in (first, second):
             assert room.size_m != judged.size_m and room.texture_seed != judged.texture_seed
 
 
 def test_a_room_looks_otherwise_in_another_light_but_stands_where_it_stood(monkeypatch):
+    monkeypatch.setattr(textures, "_FIELD_SIZE", 256)
     monkeypatch.setattr(lighting, "_SKY_DIRECTIONS", 8)
     monkeypatch.setattr(lighting, "_SUN_MAP_PX", 512)
     monkeypatch.setattr(lighting, "_GRID_M", 0.4)
