@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import KroghInterpolator
 
 from ground_station.arrays import F64
 from ground_station.calibration.detection import BoardObservation, apply_homography
@@ -118,13 +119,5 @@ def _slope(observations: list[BoardObservation], k: int, near: range, points_m: 
 
 def lagrange(nodes_s: F64, times_s: F64) -> tuple[F64, F64]:
     """Lagrange's polynomials of M nodes at N times (N, M), and their derivatives (N, M)."""
-    m = len(nodes_s)
-    off = times_s[:, None] - nodes_s  # (N, M)
-    values, slopes = np.empty_like(off), np.zeros_like(off)
-    for k in range(m):
-        others = [j for j in range(m) if j != k]
-        scale = 1 / np.prod(nodes_s[k] - nodes_s[others])
-        values[:, k] = off[:, others].prod(axis=1) * scale
-        for i in others:
-            slopes[:, k] += off[:, [j for j in others if j != i]].prod(axis=1) * scale
-    return values, slopes
+    basis = KroghInterpolator(nodes_s, np.eye(len(nodes_s)))
+    return basis(times_s), basis.derivative(times_s)
