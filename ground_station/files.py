@@ -39,16 +39,19 @@ def check_new(path: Path, *, force: bool) -> None:
         raise InputError(f"{path}: it exists already; --force overwrites it")
 
 
-def read_bytes(path: str | Path, most_bytes: int) -> bytes:
-    """What a file holds; raises `InputError` with one line, also where it is larger than that."""
+def read_bytes(
+    path: str | Path, most_bytes: int, kind: type[GroundStationError] = InputError
+) -> bytes:
+    """What a file holds; raises an error of that kind, also where it is larger than that."""
     path = Path(path)
-    with os_errors_as(path, InputError):
+    with os_errors_as(path, kind):
         if path.exists() and not path.is_file():  # a device may have no end
-            raise InputError(f"{path}: not a file")
+            raise kind(f"{path}: not a file")
         with path.open("rb") as file:
-            data = file.read(most_bytes + 1)
+            # As much as is asked for is set aside, whatever the file has.
+            data = file.read(min(os.fstat(file.fileno()).st_size, most_bytes) + 1)
     if len(data) > most_bytes:
-        raise InputError(f"{path}: more than {most_bytes >> 20} MiB")
+        raise kind(f"{path}: more than {most_bytes >> 20} MiB")
     return data
 
 

@@ -11,6 +11,7 @@ from ground_station.feature_models.torch_file import WeightsError
 from ground_station.features import catalogue, extractors, inspection
 from ground_station.features.extractor import FeatureError
 from ground_station.features.model_info import Model, ModelInfo
+from pi_firmware.wire.errors import os_errors_as
 
 _NETWORKS = (superpoint, alike)
 
@@ -52,7 +53,7 @@ def add(data: bytes, info: ModelInfo) -> Model:
     extractors.check_free(info.name)
     inspection.check(inspection.parse(data), info)
     path = catalogue.path_for(info.name)
-    try:
+    with os_errors_as(path, FeatureError):
         for taken in (catalogue.SHIPPED / path.name, path):
             if taken.exists() and taken.read_bytes() != data:
                 raise FeatureError(
@@ -60,7 +61,5 @@ def add(data: bytes, info: ModelInfo) -> Model:
                     "choose another one or take that file away"
                 )
         path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FeatureError(f"{path}: {error.strerror or error}") from None
     files.write_bytes(path, data)
     return inspection.read(path)

@@ -17,13 +17,13 @@ from ground_station import bounded
 from ground_station.arrays import F32
 from ground_station.feature_models import torch_tensors
 from ground_station.features.extractor import FeatureError
+from ground_station.files import read_bytes
 from pi_firmware.wire.text import printable
 
 Shape = tuple[int, ...]
 
 MOST_BYTES: Final = 512 << 20
 """Of a file; SuperPoint's has 5 MB."""
-_PIECE_BYTES = 1 << 20
 _SECONDS, _BYTES, _TIMES = 20, 1 << 30, 4
 """What reading a file of torch's may take, and `_TIMES` the file's bytes more."""
 
@@ -87,16 +87,8 @@ def read(path: str | Path) -> Weights:
     or that names anything besides tensors.
     """
     path = Path(path)
-    try:
-        data = bytearray()
-        with path.open("rb") as file:  # in pieces: what is asked for at once is allocated at once
-            while piece := file.read(_PIECE_BYTES):
-                data += piece
-                if len(data) > MOST_BYTES:
-                    raise WeightsError(f"{path}: more than {MOST_BYTES >> 20} MB")
-    except OSError as error:
-        raise WeightsError(f"{path}: {error.strerror or error}") from None
-    form = bytes(data) if data[8:9] == b"{" else _converted(path, bytes(data))
+    data = read_bytes(path, MOST_BYTES, WeightsError)
+    form = data if data[8:9] == b"{" else _converted(path, data)
     try:
         tensors = load(form)
     except (SafetensorError, KeyError, TypeError, ValueError) as error:  # types that numpy lacks

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import onnx
 
 from ground_station.features.extractor import FeatureError
 from ground_station.features.model_info import MAX_BYTES, Model, ModelInfo
+from ground_station.files import read_bytes
 
 OPSETS = (17, 26)
 """The oldest and the newest of ONNX's operator sets that are taken."""
@@ -45,16 +45,8 @@ def read(path: str | Path) -> Model:
     has other metadata, or a graph that is not a feature network's (see `inspection.check`).
     """
     path = Path(path)
+    data = read_bytes(path, MAX_BYTES, FeatureError)
     try:
-        with path.open("rb") as file:
-            # As much as is asked for is set aside, whatever the file has.
-            size = os.fstat(file.fileno()).st_size
-            data = file.read(min(size, MAX_BYTES) + 1)
-    except OSError as error:
-        raise FeatureError(f"{path}: {error.strerror or error}") from None
-    try:
-        if len(data) > MAX_BYTES:
-            raise FeatureError(f"more than {MAX_BYTES} bytes, which no model has")
         proto = parse(data)
         info = ModelInfo.of_metadata({item.key: item.value for item in proto.metadata_props})
         check(proto, info)

@@ -16,6 +16,7 @@ from ground_station.arrays import F64, I64
 from ground_station.errors import GeometryError
 from ground_station.files import write_text
 from ground_station.geometry import poses
+from pi_firmware.wire.errors import os_errors_as
 
 
 @dataclass(frozen=True)
@@ -98,9 +99,8 @@ def read_tum(path: str | Path) -> Trajectory:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise GeometryError(f"{path}: {error.strerror or error}") from None
+        with os_errors_as(path, GeometryError):
+            text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
         raise GeometryError(f"{path}: not a text file; wanted: lines of {_LINE}") from None
     rows: list[tuple[int, list[float]]] = []

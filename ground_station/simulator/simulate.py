@@ -38,6 +38,7 @@ from ground_station.simulator.rendering import SceneRenderer
 from ground_station.simulator.scene import Scene, SimulatorError
 from ground_station.simulator.unsteady import unsteady
 from pi_firmware.wire import files
+from pi_firmware.wire.errors import os_errors_as
 from pi_firmware.wire.recording import FRAME_INFO_TOPIC, TRUTH_TOPIC, RecordingWriter
 
 FIRST_FRAME_S = 1.0
@@ -205,10 +206,8 @@ def time_ns_of(times_s: npt.ArrayLike) -> I64:
 @contextmanager
 def _recording(path: Path) -> Iterator[RecordingWriter]:
     """A recording written beside and renamed when it is closed properly."""
-    try:
+    with os_errors_as(path.parent, SimulatorError):
         path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SimulatorError(f"{path.parent}: {error.strerror or error}") from None
     with files.replacing(path) as part, RecordingWriter(part) as writer:
         yield writer
 

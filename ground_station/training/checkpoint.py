@@ -21,6 +21,7 @@ from safetensors.numpy import save
 
 from ground_station.training.errors import TrainingError
 from pi_firmware.wire import files
+from pi_firmware.wire.errors import os_errors_as
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 _NAME = re.compile(r"step-(\d{7})\.safetensors")
@@ -49,13 +50,11 @@ def write(folder: Path, checkpoint: Checkpoint, keep_every: int) -> Path:
     path = folder / f"step-{checkpoint.step:07d}.safetensors"
     note = {"state": json.dumps(checkpoint.state), "sha256": _digest(checkpoint.arrays)}
     data = save({k: np.array(v, order="C") for k, v in checkpoint.arrays.items()}, note)
-    try:
+    with os_errors_as(path, TrainingError):
         files.write(path, data)
         for step, old in steps(folder)[:-_KEPT]:
             if step % keep_every:
                 old.unlink()
-    except OSError as error:
-        raise TrainingError(f"{path}: {error.strerror or error}") from None
     return path
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from ground_station import files
 from ground_station.training.errors import TrainingError
+from pi_firmware.wire.errors import os_errors_as
 
 
 class Log:
@@ -20,11 +21,8 @@ class Log:
 
     def add(self, kind: str, **values: Any) -> None:
         """Appends a line."""
-        try:
-            with self.path.open("a") as file:
-                file.write(json.dumps({"kind": kind, **values}) + "\n")
-        except OSError as error:
-            raise TrainingError(f"{self.path}: {error.strerror or error}") from None
+        with os_errors_as(self.path, TrainingError), self.path.open("a") as file:
+            file.write(json.dumps({"kind": kind, **values}) + "\n")
 
 
 def read(path: Path) -> list[dict[str, Any]]:

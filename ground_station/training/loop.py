@@ -33,6 +33,7 @@ from ground_station.training.pairs import Batch
 from ground_station.training.recipe import Recipe, finite, is_due
 from ground_station.training.topology import OUTPUTS
 from ground_station.training.trainer import Trainer
+from pi_firmware.wire.errors import os_errors_as
 
 _LOG_EVERY = 25
 _HELD_OUT_PAIRS = 48
@@ -93,10 +94,8 @@ def train(
     torch.backends.cudnn.allow_tf32 = False
     cv2.setNumThreads(1)
     checkpoints = out / "checkpoints"
-    try:
+    with os_errors_as(checkpoints, TrainingError):
         checkpoints.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TrainingError(f"{checkpoints}: {error.strerror or error}") from None
     start = checkpoint.newest(checkpoints)
     if start is not None and not resume:
         raise TrainingError(f"{out} holds a run at step {start.step}; go on with --resume")
