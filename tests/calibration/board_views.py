@@ -8,7 +8,7 @@ over its own area and over the exposure. Time 0 of a frame is the middle of its 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -21,20 +21,6 @@ from ground_station.geometry.camera import Camera
 _TEXELS = 48
 """Of a square's side: a multiple of a marker's bits, so that all bits are alike."""
 _JITTER = np.array([(-0.25, -0.25), (0.25, 0.25), (0.25, -0.25), (-0.25, 0.25)])
-
-
-def scaled(camera: Camera, width_px: int) -> Camera:
-    """The same lens on a sensor of fewer pixels."""
-    s = width_px / camera.width_px
-    return replace(
-        camera,
-        width_px=width_px,
-        height_px=round(camera.height_px * s),
-        fx_px=camera.fx_px * s,
-        fy_px=camera.fy_px * s,
-        cx_px=(camera.cx_px + 0.5) * s - 0.5,
-        cy_px=(camera.cy_px + 0.5) * s - 0.5,
-    )
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 import numpy.typing as npt
+import pytest
 from board_views import Waypoints, project_rolling
 
 from ground_station.calibration.board import Board
+from ground_station.calibration.calibrate import Result
 from ground_station.calibration.detection import BoardObservation, Gathered
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
 
@@ -31,6 +35,18 @@ def observed(
         time_ns = 10**18 + round(time_s * 1e9)
         found.append(BoardObservation(0, index, f"frame-{index}", time_ns, ids, px, 30.0, 1.5, H))
     return found
+
+
+def off_by(result: Result, true: Camera) -> list[float]:
+    """By how many of its own deviations each number of a lens is off, which is near the true one
+    and fits corners of the usual noise."""
+    found = result.camera
+    assert found.fx_px == pytest.approx(true.fx_px, rel=0.003)
+    assert found.fy_px == pytest.approx(true.fy_px, rel=0.003)
+    assert math.hypot(found.cx_px - true.cx_px, found.cy_px - true.cy_px) < 1.5
+    assert result.fit.rms_px == pytest.approx(0.08 * math.sqrt(2), rel=0.1)
+    deviations = result.fit.deviations.items()
+    return [(getattr(found, name) - getattr(true, name)) / sigma for name, sigma in deviations]
 
 
 def gathered(observations: list[BoardObservation], camera: Camera = THESIS_CAMERA) -> Gathered:

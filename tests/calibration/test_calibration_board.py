@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from board_views import scaled
 
 from ground_station.calibration import paper
 from ground_station.calibration.board import (
@@ -18,7 +17,6 @@ from ground_station.calibration.board import (
     write_board,
 )
 from ground_station.calibration.errors import CalibrationError
-from ground_station.geometry.camera import THESIS_CAMERA
 from pi_firmware.wire.errors import BlimpError, ConfigError
 
 POINT_MM = 25.4 / 72
@@ -133,9 +131,3 @@ def test_a_file_without_a_size_is_no_board(tmp_path: Path) -> None:
 def test_a_board_larger_than_its_paper_is_refused() -> None:
     with pytest.raises(CalibrationError, match=r"a4 has room for .* \(squares of \d+ mm\)"):
         paper.draw(new_board(10, 7, 40.0), "a4")
-
-
-def test_a_smaller_sensor_sees_the_same_rays() -> None:
-    small = scaled(THESIS_CAMERA, 320)
-    rays = np.array([[0.1, -0.2], [0.4, 0.3]])
-    assert small.distort(rays) * 2 + 0.5 == pytest.approx(THESIS_CAMERA.distort(rays))

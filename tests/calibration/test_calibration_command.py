@@ -14,20 +14,21 @@ import cv2
 import numpy as np
 import pytest
 from board_flight import write_board_flight
-from board_views import BoardCamera, carried, scaled
+from board_views import BoardCamera, carried
 
 from ground_station.calibration.board import Board, load_board, write_board
 from ground_station.calibration.live import LiveFrames, parse_uri
 from ground_station.cli import main
 from ground_station.errors import InputError
 from ground_station.geometry.camera import THESIS_CAMERA, load_camera
+from ground_station.geometry.resizing import scaled
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "evaluation"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "stream"))
 from numbered_flight import capture_ns, encoded, packets, stamped
 from parsed_page import Page
 
-CAMERA = scaled(THESIS_CAMERA, 360)
+CAMERA = scaled(THESIS_CAMERA, 360, 270)
 BOARD = Board([9, 6], 28.0, 21.0)
 
 

@@ -6,7 +6,7 @@ from typing import ClassVar
 import cv2
 import numpy as np
 import pytest
-from board_views import BoardCamera, Pictured, Waypoints, pose_of, scaled
+from board_views import BoardCamera, Pictured, Waypoints, pose_of
 
 from ground_station.arrays import U8
 from ground_station.calibration.board import Board
@@ -20,9 +20,10 @@ from ground_station.calibration.detection import (
 from ground_station.calibration.errors import CalibrationError
 from ground_station.calibration.verdict import check_seen
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
+from ground_station.geometry.resizing import scaled
 from ground_station.recording.frames import Frame
 
-CAMERA = scaled(THESIS_CAMERA, 480)
+CAMERA = scaled(THESIS_CAMERA, 480, 360)
 BOARD = Board([8, 6], 30.0, 22.5)
 FINDER = BoardFinder(BOARD, BOARD.points_m())
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from board_views import Waypoints, carried, pose_of
-from observed import BOARD, gathered, observed
+from observed import BOARD, gathered, observed, off_by
 from scipy.spatial.transform import Rotation
 
 from ground_station.calibration.calibrate import Result, at_corners_px, calibrate
@@ -51,16 +51,11 @@ def test_the_lens_is_right_and_so_are_its_deviations() -> None:
     off, lens_off = [], []
     for seed in range(3):
         result = solved(many(np.random.default_rng(seed)))
-        camera = result.camera
-        assert camera.fx_px == pytest.approx(STILL.fx_px, rel=0.003)
-        assert camera.fy_px == pytest.approx(STILL.fy_px, rel=0.003)
-        assert math.hypot(camera.cx_px - STILL.cx_px, camera.cy_px - STILL.cy_px) < 1.5
-        assert result.fit.rms_px == pytest.approx(0.08 * math.sqrt(2), rel=0.1)
-        for name in result.fit.names:
-            sigma = result.fit.deviations[name]
-            off.append((getattr(camera, name) - getattr(STILL, name)) / sigma)
+        off += off_by(result, STILL)
         for name, corner in zip(CORNERS, ((0, 0), (639, 0), (0, 479), (639, 479)), strict=True):
-            lens_off.append(astray_px(camera, corner) / at_corners_px(result.fit, (640, 480))[name])
+            lens_off.append(
+                astray_px(result.camera, corner) / at_corners_px(result.fit, (640, 480))[name]
+            )
     assert 0.3 < np.sqrt(np.mean(np.square(lens_off))) < 2
     # 27 numbers over their deviations: a root mean square near 1 (0.5 to 1.6 in all but 1 of 1000
     # draws if they were independent), none far out.

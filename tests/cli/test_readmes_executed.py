@@ -21,7 +21,7 @@ import cases_stand
 import numpy as np
 import pytest
 from board_flight import write_board_flight
-from board_views import BoardCamera, carried, scaled
+from board_views import BoardCamera, carried
 from card_bench import make_image, sum_of
 from pages import PAGES, ROOT, commands
 from quick_flight import quick_light
@@ -29,6 +29,7 @@ from quick_flight import quick_light
 from ground_station.calibration.board import Board
 from ground_station.cli import main as blimp
 from ground_station.geometry.camera import THESIS_CAMERA
+from ground_station.geometry.resizing import scaled
 from ground_station.geometry.trajectory import Trajectory, write_tum
 from ground_station.recording.frames import Frame
 from ground_station.recording.open import open_input
@@ -122,7 +123,7 @@ def building(folder: Path) -> None:
 def film_of_a_board(folder: Path) -> None:
     """The board that `blimp calibrate board` prints, long enough before the camera."""
     rng = np.random.default_rng(21)
-    camera, board = scaled(THESIS_CAMERA, 360), Board([10, 7], 25.0, 18.75)
+    camera, board = scaled(THESIS_CAMERA, 360, 270), Board([10, 7], 25.0, 18.75)
     motion = carried(camera, board, rng, 17, rest_s=0.1, move_s=0.5)
     times_s = np.arange(0.03, motion.duration_s - 0.03, 1 / 15)
     taker = BoardCamera(camera, board)
