@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
-from synthetic import NO_KEYFRAMES, apart, keyframes_of, unit_rows
+from synthetic import apart, keyframes_of, unit_rows
 
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
@@ -88,12 +88,6 @@ def test_the_right_place_is_found_among_sixty_percent_outliers(building):
     for wTc in building.path:
         found = find(building.map, building.features(wTc, outliers=0.6))
         assert off_m(found, wTc) < 0.03 and apart(found.wTc, wTc)[1] < np.radians(0.3)
-
-
-def test_without_keyframes_every_landmark_is_matched(building):
-    wTc = building.path[2]
-    features = building.features(wTc, outliers=0.6)
-    assert off_m(find(replace(building.map, keyframes=NO_KEYFRAMES), features), wTc) < 0.03
 
 
 def test_a_frame_that_shares_nothing_with_the_map_is_refused(building):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from synthetic import landmarks_at
 
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
@@ -32,20 +33,12 @@ def hall(room: Any) -> Any:
     )
     side = rng.choice([-1.0, 1.0], NEAR) * rng.uniform(1.0, 2.0, NEAR)
     near = np.column_stack([side, rng.uniform(-1.5, 1.5, NEAR), rng.uniform(4, 6, NEAR)])
-    points = np.concatenate([far, near])
-    some = dataclasses.replace(
-        room.map.landmarks,
-        **{
-            field.name: getattr(room.map.landmarks, field.name)[: len(points)]
-            for field in dataclasses.fields(room.map.landmarks)
-        },
-    )
-    landmarks = dataclasses.replace(
-        some,
-        position_m=points,
-        view_direction=np.tile([0.0, 0.0, -1.0], (len(points), 1)).astype(np.float32),
-        view_cos=np.full(len(points), -1.0, np.float32),
-        distance_m=np.tile([0.1, 100.0], (len(points), 1)).astype(np.float32),
+    count = FAR + NEAR
+    landmarks = landmarks_at(
+        np.concatenate([far, near]),
+        room.map.landmarks.descriptor[:count],
+        view_cos=np.full(count, -1.0, np.float32),
+        distance_m=np.tile([0.1, 100.0], (count, 1)).astype(np.float32),
     )
     return dataclasses.replace(room, map=dataclasses.replace(room.map, landmarks=landmarks))
 
