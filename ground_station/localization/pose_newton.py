@@ -20,6 +20,7 @@ import numpy as np
 from ground_station.arrays import F64, Bools
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
+from ground_station.localization.kinematics import LandmarkObservations
 from ground_station.localization.row_motion import RowMotion
 
 NEAREST_M = 1e-3
@@ -106,6 +107,20 @@ class Reprojection:
     camera: Camera
     huber_k: float
     by_focal_m: F64
+
+    @classmethod
+    def of(cls, seen: LandmarkObservations, camera: Camera, huber_k: float) -> Reprojection:
+        """Of what a frame's observations say, which have N first."""
+        return cls(
+            points_m=np.ascontiguousarray(seen.points_m.T, np.float64),
+            offset_px=np.ascontiguousarray((seen.pinhole_px - [camera.cx_px, camera.cy_px]).T),
+            covariance_m2=np.ascontiguousarray(seen.covariance_m2.transpose(1, 2, 0), np.float64),
+            variance_px2=np.square(seen.sigma_px, dtype=np.float64),
+            row_s=np.asarray(seen.row_s, np.float64),
+            camera=camera,
+            huber_k=huber_k,
+            by_focal_m=seen.by_focal_m.T,
+        )
 
     @property
     def count(self) -> int:

@@ -73,18 +73,7 @@ def solve_rolling(
     prior = _prior(predicted)
     if prior is None:
         return no_solution(count, "the prediction's covariance is not positive definite")
-    every = Reprojection(
-        points_m=np.ascontiguousarray(observations.points_m.T, np.float64),
-        offset_px=np.ascontiguousarray((observations.pinhole_px - [camera.cx_px, camera.cy_px]).T),
-        covariance_m2=np.ascontiguousarray(
-            observations.covariance_m2.transpose(1, 2, 0), np.float64
-        ),
-        variance_px2=np.square(observations.sigma_px, dtype=np.float64),
-        row_s=np.asarray(observations.row_s, np.float64),
-        camera=camera,
-        huber_k=settings.huber_k,
-        by_focal_m=observations.by_focal_m.T,
-    )
+    every = Reprojection.of(observations, camera, settings.huber_k)
     chosen, inlier, iterations, noise = every, np.ones(count, bool), 0, 1.0
     wTc, twist = np.asarray(predicted.wTc, np.float64), np.asarray(predicted.twist, np.float64)
     with np.errstate(all="ignore"):  # what is not finite is a reason below

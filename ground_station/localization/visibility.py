@@ -106,9 +106,9 @@ class _Spheres:
 class LandmarkIndex:
     """Landmarks in cells, cells in blocks; a block out of view costs one test for all of its."""
 
-    def __init__(self, landmarks: Landmarks, cell_m: float = _CELL_M) -> None:
+    def __init__(self, landmarks: Landmarks) -> None:
         """Takes positions as they are: landmarks that move need another index."""
-        cell = np.floor(landmarks.position_m / cell_m).astype(np.int64)
+        cell = np.floor(landmarks.position_m / _CELL_M).astype(np.int64)
         block = cell // _CELLS_A_BLOCK
         keys = [*cell.T, *block.T]
         self._order = np.lexsort(keys)

@@ -76,19 +76,6 @@ def _error(state: Kinematics, twist: np.ndarray = TWIST) -> np.ndarray:
     return np.concatenate([poses.log(poses.inverse(state.wTc) @ TRUE), twist - state.twist])
 
 
-def _reprojection(observations: LandmarkObservations, huber_k: float = 1.345) -> Reprojection:
-    return Reprojection(
-        np.ascontiguousarray(observations.points_m.T),
-        (observations.pinhole_px - [CAMERA.cx_px, CAMERA.cy_px]).T.copy(),
-        np.ascontiguousarray(observations.covariance_m2.transpose(1, 2, 0)),
-        observations.sigma_px**2,
-        observations.row_s,
-        CAMERA,
-        huber_k,
-        observations.by_focal_m.T,
-    )
-
-
 def test_pose_and_velocity_are_recovered_among_a_fifth_of_outliers():
     predicted, observations, wrong = _scene(np.random.default_rng(1), outliers=0.2, noise_px=0.3)
     solution = solve_rolling(predicted, observations, CAMERA, SETTINGS)
@@ -170,7 +157,7 @@ def test_errors_are_as_large_as_the_covariance_says(landmark_m):
 @pytest.mark.parametrize("twist", [TWIST, np.zeros(6)])
 def test_the_jacobian_is_that_of_finite_differences(twist):
     observations = _scene(np.random.default_rng(3), count=40, twist=twist)[1]
-    cost = _reprojection(observations)
+    cost = Reprojection.of(observations, CAMERA, 1.345)
     J = cost.view(TRUE, twist).jacobian()
     step = 1e-6
     for k in range(12):
@@ -187,7 +174,7 @@ def test_the_jacobian_is_that_of_finite_differences(twist):
 def test_gradient_and_landmarks_jacobian_are_those_of_finite_differences():
     rng = np.random.default_rng(4)
     predicted, observations, _ = _scene(rng, count=60, landmark_m=0.01, outliers=0.3)
-    cost = _reprojection(observations)
+    cost = Reprojection.of(observations, CAMERA, 1.345)
     start = cost.linearize(predicted.wTc, predicted.twist)
     for _ in range(3):  # the weights of outliers take a few rounds where landmarks are elongated
         start = cost.linearize(predicted.wTc, predicted.twist, start)
