@@ -40,9 +40,10 @@ def fp32(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     return inspection.read(made_up.write_pixels(folder, about))
 
 
-def made(fp32: Model, folder: Path) -> Model:
+@pytest.fixture(scope="module")
+def int8(fp32: Model, tmp_path_factory: pytest.TempPathFactory) -> Model:
     data, info = quantize.int8(fp32, IMAGES, "made-up-int8")
-    path = folder / f"{info.name}.onnx"
+    path = tmp_path_factory.mktemp("int8") / f"{info.name}.onnx"
     path.write_bytes(data)
     return inspection.read(path)
 
@@ -54,17 +55,16 @@ def outputs(found: Model, image: np.ndarray) -> dict[str, np.ndarray]:
     return dict(zip(names, session.run(names, {"image": blob}), strict=True))
 
 
-def test_a_form_says_nearly_what_the_model_says(tmp_path: Path, fp32: Model) -> None:
-    found = made(fp32, tmp_path)
-    whole, less = outputs(fp32, IMAGES[0]), outputs(found, IMAGES[0])
+def test_a_form_says_nearly_what_the_model_says(fp32: Model, int8: Model) -> None:
+    whole, less = outputs(fp32, IMAGES[0]), outputs(int8, IMAGES[0])
     assert whole.keys() == less.keys()
     for name, wanted in whole.items():
         error = np.sqrt(np.mean((less[name] - wanted) ** 2)) / wanted.std()
         assert 0 < error < 0.1, (name, error)
 
 
-def test_an_int8_form_computes_with_integers_but_for_the_heads(tmp_path: Path, fp32: Model) -> None:
-    graph = onnx.load_model_from_string(made(fp32, tmp_path).data).graph
+def test_an_int8_form_computes_with_integers_but_for_the_heads(fp32: Model, int8: Model) -> None:
+    graph = onnx.load_model_from_string(int8.data).graph
     makers = {name: node.op_type for node in graph.node for name in node.output}
     constants = {tensor.name: numpy_helper.to_array(tensor) for tensor in graph.initializer}
     kinds = [makers.get(node.input[1], "float") for node in graph.node if node.op_type == "Conv"]
@@ -76,13 +76,12 @@ def test_an_int8_form_computes_with_integers_but_for_the_heads(tmp_path: Path, f
         assert np.all(np.abs(array.astype(int)).max(axis=(1, 2, 3)) == 64)
 
 
-def test_a_form_is_a_model_of_its_own(tmp_path: Path, fp32: Model) -> None:
-    found = made(fp32, tmp_path)
-    assert found.info.name == "made-up-int8" and found.sha256 != fp32.sha256
-    assert found.info.source.endswith(f"; int8 of made-up {fp32.sha256[:16]}")
-    assert (found.info.licence, found.info.layout) == (fp32.info.licence, fp32.info.layout)
+def test_a_form_is_a_model_of_its_own(fp32: Model, int8: Model) -> None:
+    assert int8.info.name == "made-up-int8" and int8.sha256 != fp32.sha256
+    assert int8.info.source.endswith(f"; int8 of made-up {fp32.sha256[:16]}")
+    assert (int8.info.licence, int8.info.layout) == (fp32.info.licence, fp32.info.layout)
     with pytest.raises(FeatureError, match="'made-up-int8' is no fp32 model"):
-        quantize.int8(found, IMAGES, "again")
+        quantize.int8(int8, IMAGES, "again")
 
 
 def test_without_pictures_nothing_is_quantized(fp32: Model) -> None:

@@ -25,6 +25,7 @@ cx_px = 319.5
 cy_px = 239.5
 k1 = 0.1
 """
+FISHEYES = 'model = "fisheye"\n' + GOOD.replace("k1 = 0.1", "k1 = -0.02\nk4 = 0.001")
 
 
 def points_in_view(n: int = 400) -> np.ndarray:
@@ -104,6 +105,9 @@ def test_a_camera_file_is_read(tmp_path: Path) -> None:
     path.write_text(GOOD)
     camera = load_camera(path)
     assert (camera.fy_px, camera.k1, camera.k2, camera.readout_s) == (501.0, 0.1, 0.0, 0.0)
+    path.write_text(FISHEYES)
+    camera = load_camera(path)
+    assert (camera.model, camera.k1, camera.k2, camera.k4) == ("fisheye", -0.02, 0.0, 0.001)
 
 
 @pytest.mark.parametrize(
@@ -123,17 +127,26 @@ def test_a_camera_file_is_read(tmp_path: Path) -> None:
         (("k1 = 0.1", "k4 = 0.0"), "k4 is of model = 'fisheye'"),
         (("k1 = 0.1", "readout_s = 20"), "readout_s"),
         (("k1 = 0.1", "k1 = "), "TOML"),
+        (("k4 = 0.001", "p1 = 0.0"), "p1 is of model = 'opencv5'.*remove p1, or change model"),
+        (("k4 = 0.001", "p2 = 0.1"), "p2 is of model = 'opencv5'"),
+        (("k4 = 0.001", "k5 = 0.1"), "unknown key 'k5'"),
+        (("k4 = 0.001", "k4 = nan"), "k4"),
+        (("fisheye", "opencv5"), "k4 is of model = 'fisheye'.*remove k4, or change model"),
+        (('model = "fisheye"\n', ""), "k4 is of model = 'fisheye'"),
+        (("k1 = -0.02", "k1 = -1.5"), "turn the picture back 27° from the axis.*model = 'opencv5'"),
     ],
 )
 def test_a_wrong_camera_file_is_refused_in_one_line_that_names_the_key(
     tmp_path: Path, change: tuple[str, str], names: str
 ) -> None:
     path = tmp_path / "camera.toml"
-    path.write_text(GOOD.replace(*change))
-    with pytest.raises(CameraError) as error:
+    whole = GOOD if change[0] in GOOD else FISHEYES
+    assert change[0] in whole
+    path.write_text(whole.replace(*change))
+    with pytest.raises(CameraError, match=names) as error:
         load_camera(path)
     text = str(error.value)
-    assert names in text and str(path) in text and "\n" not in text
+    assert str(path) in text and "\n" not in text
 
 
 def test_a_missing_camera_file_is_named(tmp_path: Path) -> None:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from ground_station.errors import CameraError
-from ground_station.geometry.camera import THESIS_CAMERA, Camera, load_camera
+from ground_station.geometry.camera import THESIS_CAMERA, Camera
 from ground_station.geometry.lens_models import WIDEST
 
 EQUIDISTANT = Camera(
@@ -25,17 +23,6 @@ NARROW = replace(USUAL, fx_px=700.0, fy_px=700.0)
 BENT = replace(THESIS_CAMERA, p1=0.02, k3=0.1)
 LENSES = [EQUIDISTANT, USUAL, FOLDING, NARROW]
 CAMERAS = pytest.mark.parametrize("camera", LENSES)
-GOOD = """\
-model = "fisheye"
-width_px = 640
-height_px = 480
-fx_px = 244.0
-fy_px = 244.0
-cx_px = 319.5
-cy_px = 239.5
-k1 = -0.02
-k4 = 0.001
-"""
 
 
 def directions(most_deg: float, n: int = 2000) -> np.ndarray:
@@ -158,32 +145,3 @@ def test_the_file_holds_the_models_own_keys_and_old_files_are_as_they_were() -> 
         "k1", "k2", "p1", "p2", "k3", "readout_s", "model",
     ]  # fmt: skip
     assert asdict(THESIS_CAMERA)["k4"] == 0
-
-
-def test_a_fisheyes_file_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "camera.toml"
-    path.write_text(GOOD)
-    camera = load_camera(path)
-    assert (camera.model, camera.k1, camera.k2, camera.k4) == ("fisheye", -0.02, 0.0, 0.001)
-
-
-@pytest.mark.parametrize(
-    ("change", "names"),
-    [
-        (("k4 = 0.001", "p1 = 0.0"), "p1 is of model = 'opencv5'.*remove p1, or change model"),
-        (("k4 = 0.001", "p2 = 0.1"), "p2 is of model = 'opencv5'"),
-        (("k4 = 0.001", "k5 = 0.1"), "unknown key 'k5'"),
-        (("k4 = 0.001", "k4 = nan"), "k4"),
-        (("fisheye", "opencv5"), "k4 is of model = 'fisheye'.*remove k4, or change model"),
-        (('model = "fisheye"\n', ""), "k4 is of model = 'fisheye'"),
-        (("k1 = -0.02", "k1 = -1.5"), "turn the picture back 27° from the axis.*model = 'opencv5'"),
-    ],
-)
-def test_keys_that_contradict_the_model_are_refused_by_name(
-    tmp_path: Path, change: tuple[str, str], names: str
-) -> None:
-    path = tmp_path / "camera.toml"
-    path.write_text(GOOD.replace(*change))
-    with pytest.raises(CameraError, match=names) as error:
-        load_camera(path)
-    assert "\n" not in str(error.value) and str(path) in str(error.value)

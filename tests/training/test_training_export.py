@@ -16,6 +16,12 @@ from ground_station.training.errors import TrainingError
 from ground_station.training.topology import OUTPUTS, SHAPES, shape_of
 
 
+@pytest.fixture(autouse=True)
+def scale(monkeypatch) -> None:
+    """It has tests of its own, and is not measured each time."""
+    monkeypatch.setattr(export.scale, "measured", lambda data, info: 1.25)
+
+
 def counted(path, rows: int, columns: int) -> int:
     """Products of the file's convolutions, from its own shapes."""
     proto = onnx.load(str(path))
@@ -54,6 +60,7 @@ def test_the_file_is_the_same_each_time_and_extracts(tmp_path):
     assert paths[0].read_bytes() == paths[1].read_bytes()
     read = inspection.read(paths[0])
     assert (read.info.name, read.info.layout, read.info.dimension) == ("lark", "blobs", 64)
+    assert read.info.distance_scale == 1.25
     picture = images.procedural(1, 0, (120, 168))  # no multiple of 16: it is padded
     found = BlobFeatures(Network(read), 200, LearnedSettings()).extract(picture)
     assert len(found) > 20
