@@ -22,12 +22,10 @@ NOW = datetime.datetime.now(datetime.UTC)
 
 
 @pytest.fixture
-def authority(tmp_path: Path) -> Authority:
-    made = Authority.create(tmp_path / "keys")
-    made.add("ground", "main")
-    made.add("payload", "blimp-1")
-    made.add("payload", "blimp-2")
-    return made
+def authority(authority: Authority) -> Authority:
+    """With a second payload."""
+    authority.add("payload", "blimp-2")
+    return authority
 
 
 def test_every_file_is_its_owners_only_and_nothing_is_left_half(authority: Authority) -> None:

@@ -10,7 +10,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from firmware_program import LIMIT_S, Program
 from receiving import Receiver
+from short_certificates import certify
 
 from ground_station.keys import certificates
 from ground_station.keys.authority import Authority
@@ -19,7 +21,6 @@ from ground_station.stream.srtp import load_keys
 from ground_station.stream.telemetry import TelemetryListener
 
 SHIM = Path(__file__).with_name("system_clock.c")
-LIMIT_S = 60.0
 PATIENCE_S = 6.0
 FRAMES = 30
 YEAR_NS = 365 * 24 * 3600 * 10**9
@@ -50,45 +51,9 @@ def in_1970(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 @pytest.fixture
-def authority(tmp_path: Path) -> Authority:
-    made = Authority.create(tmp_path / "keys")
-    made.add("ground", "main")
-    made.add("payload", "blimp-1")
-    return made
-
-
-@pytest.fixture
 def listener(authority: Authority) -> Iterator[TelemetryListener]:
     with TelemetryListener(["tls/127.0.0.1:0"], certificates=authority.of("ground.main")) as opened:
         yield opened
-
-
-class Program:
-    """The payload's program with its certificates; a context manager that ends it."""
-
-    def __init__(self, environment: dict[str, str], folder: Path, endpoint: str, port: int) -> None:
-        settings = (
-            "camera.uri=test:", "camera.width_px=320", "camera.height_px=240",
-            "camera.rate_hz=15", f"link.port={port}", f"telemetry.certificates={folder}",
-            f'telemetry.connect=["{endpoint}"]', "wifi.interface=",
-        )  # fmt: skip
-        overrides = [part for setting in settings for part in ("--set", setting)]
-        self._command = [sys.executable, "-m", "pi_firmware", *overrides]
-        self._environment = environment
-
-    def __enter__(self) -> "Program":
-        self._process = subprocess.Popen(
-            self._command, env=self._environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-        )
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.terminate()
-        try:
-            self._process.communicate(timeout=LIMIT_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.communicate()
 
 
 def test_a_board_in_1970_comes_up_with_mutual_tls_and_exact_latencies(
@@ -98,7 +63,7 @@ def test_a_board_in_1970_comes_up_with_mutual_tls_and_exact_latencies(
     own = authority.of("payload.blimp-1")
     with (
         Receiver(0, queue_frames=FRAMES, srtp_keys=keys) as receiver,
-        Program(in_1970, own, listener.endpoints[0], receiver.port),
+        Program(own, listener.endpoints, receiver.port, in_1970),
     ):
         assert listener.wait("blimp-1", lambda s: s.alive and s.ssrc is not None, LIMIT_S)
         deadline = time.monotonic() + LIMIT_S
@@ -130,21 +95,13 @@ def test_the_shifted_clock_is_the_one_that_certificates_are_judged_by(
     monkeypatch.setattr(
         certificates, "VALID_FROM", datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
     )
-    late = Path(shutil.copytree(authority.of("ground.main"), tmp_path / "late"))
-    signer = authority.folder / "authorities"
-    pair = certificates.make_certificate(
-        "ground.main",
-        certificates.Pair((signer / "1.pem").read_bytes(), (signer / "1.key").read_bytes()),
-        datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=9),
-    )
-    (late / "certificate.pem").write_bytes(pair.certificate)
-    (late / "key.pem").write_bytes(pair.key)
+    late = certify(authority, "ground.main", tmp_path / "late", datetime.timedelta(days=9))
     own = authority.of("payload.blimp-1")
-    cases = ((dict(os.environ), True, LIMIT_S), (in_1970, False, PATIENCE_S))
+    cases = ((None, True, LIMIT_S), (in_1970, False, PATIENCE_S))
     for environment, expected, wait_s in cases:
         with (
             TelemetryListener(["tls/127.0.0.1:0"], certificates=late) as listener,
-            Program(environment, own, listener.endpoints[0], port=9),
+            Program(own, listener.endpoints, environment=environment),
         ):
             alive = listener.wait("blimp-1", lambda s: s.alive, wait_s)
             assert (alive is not None) is expected

@@ -6,34 +6,22 @@ has expired, one without any, one that was taken off the list. A good one hears 
 
 import datetime
 import shutil
-import subprocess
-import sys
-import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from firmware_program import LIMIT_S, LOOK_S, Program
+from short_certificates import certify
 
 from ground_station.keys.authority import Authority
-from ground_station.keys.certificates import Pair, make_certificate
 from ground_station.stream.command import ask
 from ground_station.stream.telemetry import TelemetryListener
 from pi_firmware.wire import credentials, keys, messages
 from pi_firmware.wire.refusal import refusal
 
-LIMIT_S = 60.0
 LOOKS = 3  # times that each is looked at again after it was complained of
-LOOK_S = 0.5
-# The clock's task looks twice a second instead of each ten; all else is as it flies.
-PROGRAM = f"""
-import sys
-from pi_firmware import supervision
-supervision._CLOCK_S, supervision._SILENCE_S = {LOOK_S}, 0.5
-from pi_firmware.__main__ import main
-sys.exit(main())
-"""
 WRONG = ("foreign", "expired", "bare", "unlisted")
 
 
@@ -47,21 +35,12 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         authority.add("payload", "blimp-1")
     payload = Path(shutil.copytree(ours.of("payload.blimp-1"), room / "payload"))
     ours.add("ground", "later")  # the payload's copy does not list it
-    expired = Path(shutil.copytree(ours.of("ground.main"), room / "expired"))
-    signer = ours.folder / "authorities"
-    ended = datetime.datetime.now(datetime.UTC).replace(microsecond=0) - datetime.timedelta(days=1)
-    pair = make_certificate(
-        "ground.main",
-        Pair((signer / "1.pem").read_bytes(), (signer / "1.key").read_bytes()),
-        ended,
-    )
-    (expired / "certificate.pem").write_bytes(pair.certificate)
-    (expired / "key.pem").write_bytes(pair.key)
+    ended = datetime.timedelta(days=-1)
     return {
         "payload": payload,
         "good": ours.of("ground.main"),
         "foreign": theirs.of("ground.main"),
-        "expired": expired,
+        "expired": certify(ours, "ground.main", room / "expired", ended),
         "unlisted": ours.of("ground.later"),
     }
 
@@ -81,55 +60,6 @@ def grounds(folders: dict[str, Path]) -> Iterator[dict[str, TelemetryListener]]:
 
 def endpoint(listener: TelemetryListener) -> str:
     return "tls/" + listener.endpoints[0].partition("/")[2]
-
-
-class Program:
-    """The payload's program; keeps what it says on standard error. A context manager."""
-
-    def __init__(self, certificates: Path, connect: list[str]) -> None:
-        quoted = ", ".join(f'"{to}"' for to in connect)
-        settings = (
-            "camera.uri=test:", "camera.width_px=320", "camera.height_px=240", "camera.rate_hz=5",
-            "link.port=9", f"telemetry.certificates={certificates}",
-            f"telemetry.connect=[{quoted}]", "telemetry.listen=[]",
-        )  # fmt: skip
-        self._command = [sys.executable, "-c", PROGRAM]
-        self._command += [word for setting in settings for word in ("--set", setting)]
-        self.said: list[str] = []
-        self._changed = threading.Condition()
-
-    def __enter__(self) -> "Program":
-        self._process = subprocess.Popen(
-            self._command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-        )
-        self._reader = threading.Thread(target=self._read)
-        self._reader.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.terminate()
-        try:
-            self._process.wait(LIMIT_S)
-        finally:
-            self._process.kill()
-            self._reader.join()
-
-    def wait(self, words: str) -> str:
-        """The first line with these words."""
-
-        def found() -> str | None:
-            return next((line for line in self.said if words in line), None)
-
-        with self._changed:
-            assert self._changed.wait_for(lambda: found() is not None, LIMIT_S), (words, self.said)
-        return found() or ""
-
-    def _read(self) -> None:
-        assert self._process.stderr is not None
-        for line in self._process.stderr:
-            with self._changed:
-                self.said.append(line.rstrip())
-                self._changed.notify_all()
 
 
 def answers(listener: TelemetryListener) -> int:

@@ -13,14 +13,6 @@ from ground_station.keys.authority import Authority
 NAMESPACE = "blimp-release"
 
 
-@pytest.fixture
-def authority(tmp_path: Path) -> Authority:
-    made = Authority.create(tmp_path / "keys")
-    made.add("ground", "main")
-    made.add("payload", "blimp-1")
-    return made
-
-
 def signers(authority: Authority) -> Path:
     return authority.of("payload.blimp-1") / "allowed_signers"
 

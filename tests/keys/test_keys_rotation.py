@@ -47,11 +47,10 @@ def is_heard(listener: TelemetryListener, telemetry: Telemetry, voltage: float) 
     return False
 
 
-def test_payload_and_ground_speak_at_each_step_of_a_rotation(tmp_path: Path) -> None:
+def test_payload_and_ground_speak_at_each_step_of_a_rotation(
+    authority: Authority, tmp_path: Path
+) -> None:
     """At each step one is restarted with its new folder, then the other, in either order."""
-    authority = Authority.create(tmp_path / "keys")
-    authority.add("ground", "main")
-    authority.add("payload", "blimp-1")
     at_ground = Machine(authority, "ground.main", tmp_path / "at ground")
     at_payload = Machine(authority, "payload.blimp-1", tmp_path / "at payload")
     at_ground.copy()
