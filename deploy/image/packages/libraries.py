@@ -2,26 +2,26 @@
 
     python -m deploy.image.packages.libraries ROOT
 
-Packages' files are left out on purpose (`left_out`); this says when one too many was. It reads the
-ELF files themselves (System V gABI, chapters 4 and 5), so that no program of the board is run.
+Packages' files are left out on purpose (`left_out`); this says when one too many was. It asks
+readelf(1), which knows every machine's files, so that no program of the board is run.
 """
 
 from __future__ import annotations
 
-import struct
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from deploy.errors import DeployError
+from deploy.run import run
 
 # Where a program, or what a program loads by name, lies; libraries are looked for from these on.
 _PROGRAMS = ("usr/bin", "usr/sbin", "usr/libexec", "usr/lib/systemd", "usr/lib/openssh")
 _LOADED = ("gstreamer-1.0", "gstreamer1.0", "libcamera", "security")
 _PYTHON = ("usr/lib/python3", "usr/lib/python3.*")
 
-_PT_LOAD, _PT_DYNAMIC = 1, 2
-_DT_NULL, _DT_NEEDED, _DT_STRTAB = 0, 1, 5
+_NEEDED = re.compile(r"\(NEEDED\) +Shared library: \[(.*)\]$", re.MULTILINE)
 
 
 def needed(path: Path) -> tuple[str, ...] | None:
@@ -30,47 +30,12 @@ def needed(path: Path) -> tuple[str, ...] | None:
     Raises `DeployError` for an ELF file that is cut.
     """
     with path.open("rb") as file:
-        ident = file.read(16)
-        if ident[:4] != b"\x7fELF":
+        if file.read(4) != b"\x7fELF":
             return None
-        data = ident + file.read()
-    try:
-        return tuple(_names(data))
-    except (struct.error, ValueError, IndexError, RuntimeError, StopIteration):
-        raise DeployError(f"{path}: the ELF file is cut or damaged") from None
-
-
-def _names(data: bytes) -> Iterator[str]:
-    wide, order = data[4] == 2, "<" if data[5] == 1 else ">"
-    (table,) = struct.unpack_from(f"{order}{'Q' if wide else 'I'}", data, 32 if wide else 28)
-    size, count = struct.unpack_from(f"{order}HH", data, 54 if wide else 42)
-    segments = [_segment(data, table + i * size, wide, order) for i in range(count)]
-    entry = struct.Struct(f"{order}QQ" if wide else f"{order}II")
-    tags: list[tuple[int, int]] = []
-    for kind, offset, _, length in segments:
-        if kind == _PT_DYNAMIC:
-            tags += (entry.unpack_from(data, offset + i) for i in range(0, length, entry.size))
-    ends = next((i for i, (tag, _) in enumerate(tags) if tag == _DT_NULL), len(tags))
-    names = [value for tag, value in tags[:ends] if tag == _DT_NEEDED]
-    if not names:
-        return
-    address = next(value for tag, value in tags[:ends] if tag == _DT_STRTAB)
-    strings = next(
-        offset + address - start
-        for kind, offset, start, length in segments
-        if kind == _PT_LOAD and start <= address < start + length
-    )
-    for name in names:
-        yield data[strings + name : data.index(b"\0", strings + name)].decode()
-
-
-def _segment(data: bytes, at: int, wide: bool, order: str) -> tuple[int, int, int, int]:
-    """A program header: type, offset in the file, address, length in the file, bytes."""
-    if wide:
-        kind, _, offset, address, _, length = struct.unpack_from(f"{order}IIQQQQ", data, at)
-    else:
-        kind, offset, address, _, length = struct.unpack_from(f"{order}IIIII", data, at)
-    return kind, offset, address, length
+    said = run(["readelf", "--dynamic", "--wide", path], ok=(0, 1), merge=True)
+    if b"readelf: Error: " in said:
+        raise DeployError(f"{path}: the ELF file is cut or damaged")
+    return tuple(_NEEDED.findall(said.decode(errors="replace")))
 
 
 def missing(root: Path) -> list[str]:
