@@ -9,13 +9,15 @@ import os
 import shutil
 import subprocess
 import tarfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+import pytest
 
 from deploy.image import card
 from deploy.image.packages.board import load_board
 from deploy.image.packages.kernel import Kernel
+from deploy.run import find, run
 
 CHECKOUT = Path(__file__).parents[3]
 EPOCH = 1_760_000_000
@@ -285,18 +287,19 @@ class ImageReader:
         lines = self._run("dumpe2fs", "-h", str(part)).splitlines()
         return {line.partition(":")[0]: line.partition(":")[2].strip() for line in lines}
 
+    def check(self) -> None:
+        """Fails where a file system is not clean."""
+        for part in (self.root, self.data):
+            run(["e2fsck", "-fn", part])
+        run(["fsck.vfat", "-n", self.boot])
+
     @staticmethod
     def _run(*words: str) -> str:
-        path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
-        tool = shutil.which(words[0], path=path) or words[0]
-        done = subprocess.run(
-            [tool, *words[1:]], capture_output=True, check=True, env={**os.environ, "TZ": "UTC"}
-        )
-        return done.stdout.decode()
+        return run(words, env={"TZ": "UTC"}).decode()
 
 
-def missing_tools() -> Iterator[str]:
-    """Tools of Debian that building a card needs and that are not here."""
-    path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
-    tools = ("mke2fs", "debugfs", "e2fsck", "mkfs.vfat", "mcopy", "sfdisk", "bmaptool", "git")
-    return (tool for tool in tools if shutil.which(tool, path=path) is None)
+_TOOLS = ("mke2fs", "debugfs", "e2fsck", "mkfs.vfat", "mcopy", "sfdisk", "bmaptool", "git")
+needs_tools = pytest.mark.skipif(
+    (lack := [tool for tool in _TOOLS if find(tool) is None]) != [],
+    reason=f"not installed: {', '.join(lack)}",
+)

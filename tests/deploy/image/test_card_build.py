@@ -17,23 +17,17 @@ from card_parts import (
     RELEASE,
     ImageReader,
     build,
-    make_checkout,
     make_ingredients,
-    missing_tools,
+    needs_tools,
 )
 
 from deploy.errors import DeployError
 from deploy.image import __main__ as command
 from deploy.image import card, sparse
+from deploy.provisioning.text import parse
+from deploy.run import run
 
-pytestmark = pytest.mark.skipif(
-    (lack := list(missing_tools())) != [], reason=f"not installed: {', '.join(lack)}"
-)
-
-
-@pytest.fixture(scope="module")
-def checkout(tmp_path_factory):
-    return make_checkout(tmp_path_factory.mktemp("checkout"))
+pytestmark = needs_tools
 
 
 @pytest.fixture(scope="module")
@@ -59,10 +53,7 @@ def test_three_partitions_that_begin_at_whole_erase_units(image, reader):
 
 
 def test_file_systems_are_clean_and_named_as_fstab_and_the_kernel_line_name_them(reader):
-    path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
-    for part in (reader.root, reader.data):
-        subprocess.run([shutil.which("e2fsck", path=path), "-fn", part], check=True)
-    subprocess.run([shutil.which("fsck.vfat", path=path), "-n", reader.boot], check=True)
+    reader.check()
     labels = {reader.facts(part)["Filesystem volume name"] for part in (reader.root, reader.data)}
     assert labels == {"blimp-root", "blimp-data"}
     assert reader.boot.read_bytes()[71:82] == b"BLIMPBOOT  "
@@ -93,8 +84,6 @@ def test_the_boot_partition_has_what_the_first_stages_read(reader):
 
 
 def test_the_example_on_the_boot_partition_is_a_valid_provisioning(reader):
-    from deploy.provisioning.text import parse
-
     text = reader.boot_text("blimp/blimp-example.toml")
     assert parse(text.encode()).payload_id == "blimp-1"
 
@@ -109,12 +98,10 @@ def test_owners_modes_times_and_capabilities_are_the_tars(reader):
     older, newer = reader.stat("usr/lib/os-release"), reader.stat("usr/bin/busybox")
     assert older["mtime"].startswith(f"{1_700_000_000:#x}")
     assert newer["mtime"].startswith(f"{EPOCH:#x}"), "nothing is younger than the epoch"
+    clock = reader.stat("usr/lib/clock-epoch")
+    assert clock["mtime"] == newer["mtime"], "where the clock of a board without one starts"
     said = reader.debugfs('ea_get -x "/usr/bin/iw" security.capability')
     assert CAPABILITY.hex() in said.replace(" ", "")
-
-
-def test_the_clock_of_a_board_without_one_starts_at_the_epoch(reader):
-    assert reader.stat("usr/lib/clock-epoch")["mtime"].startswith(f"{EPOCH:#x}")
 
 
 def test_firmware_wheels_programs_and_board_are_in_their_places(reader, checkout):
@@ -136,24 +123,17 @@ def test_firmware_wheels_programs_and_board_are_in_their_places(reader, checkout
 
 
 def test_no_account_has_a_password_or_an_empty_one(reader):
-    passwd = [line.split(":") for line in reader.read("etc/passwd").splitlines()]
-    shadow = {
-        row[0]: row for row in (line.split(":") for line in reader.read("etc/shadow").splitlines())
-    }
-    assert {row[0] for row in passwd} == set(shadow)
-    assert all(row[1] == "x" for row in passwd)
+    passwd, shadow = reader.rows("etc/passwd"), reader.rows("etc/shadow")
+    assert set(passwd) == set(shadow)
+    assert all(row[1] == "x" for row in passwd.values())
     assert all(row[1] == "*" and row[2] == "" for row in shadow.values())
     assert "$6$" not in reader.read("etc/shadow") + reader.read("etc/gshadow")
     shadow_file = reader.stat("etc/shadow")
     assert (shadow_file["mode"], shadow_file["uid"], shadow_file["gid"]) == ("0640", "0", "42")
-    numbers = {row[0]: (row[2], row[3]) for row in passwd}
-    assert numbers["blimp"] == ("901", "901") and numbers["pilot"] == ("1000", "1000")
-    assert "somebody" not in numbers, "a person of the base"
-    groups = {
-        row[0]: row[3]
-        for row in (line.split(":") for line in reader.read("etc/group").splitlines())
-    }
-    assert "blimp" in groups["video"] and "blimp" in groups["i2c"] and "blimp" in groups["dialout"]
+    assert passwd["blimp"][2:4] == ["901", "901"] and passwd["pilot"][2:4] == ["1000", "1000"]
+    assert "somebody" not in passwd, "a person of the base"
+    groups = reader.rows("etc/group")
+    assert all("blimp" in groups[name][3] for name in ("video", "i2c", "dialout"))
 
 
 def test_what_is_of_one_machine_or_day_is_not_on_the_card(reader):
@@ -209,14 +189,9 @@ def test_systemctl_would_enable_the_same(unpacked, tmp_path):
 def test_the_initrd_loads_modules_in_the_order_of_their_dependencies(reader, tmp_path):
     archive = tmp_path / "initrd"
     reader._run("mcopy", "-n", "-i", str(reader.boot), "::initrd.img", str(archive))
-    listed = subprocess.run(
-        ["cpio", "-i", "--to-stdout", "--quiet", "modules/*", "init"],
-        input=gzip.decompress(archive.read_bytes()), capture_output=True, check=True,
-    ).stdout  # fmt: skip
-    names = subprocess.run(
-        ["cpio", "-t", "--quiet"],
-        input=gzip.decompress(archive.read_bytes()), capture_output=True, check=True, text=False,
-    ).stdout.decode().split()  # fmt: skip
+    packed = gzip.decompress(archive.read_bytes())
+    listed = run(["cpio", "-i", "--to-stdout", "--quiet", "modules/*", "init"], input=packed)
+    names = run(["cpio", "-t", "--quiet"], input=packed).decode().split()
     modules = [name.partition("-")[2] for name in names if name.startswith("modules/")]
     assert modules == ["crc32c_generic.ko", "crc16.ko", "jbd2.ko", "ext4.ko"]
     assert f"ext4 of {RELEASE}".encode() in listed, "unpacked for insmod"
@@ -247,71 +222,47 @@ def test_a_card_that_held_something_else_is_whole_after_its_mapped_blocks_are_wr
     bmap = card.beside(image, ".bmap")
     subprocess.run(["bmaptool", "-q", "copy", "--bmap", bmap, image, used], check=True)
     reader = ImageReader(used, tmp_path / "parts")
-    path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
-    for part in (reader.root, reader.data):
-        subprocess.run([shutil.which("e2fsck", path=path), "-fn", part], check=True)
-    subprocess.run([shutil.which("fsck.vfat", path=path), "-n", reader.boot], check=True)
-    journal = _journal(reader)
+    reader.check()
+    reader.debugfs(f"dump <8> {tmp_path / 'journal'}", reader.data)
+    journal = (tmp_path / "journal").read_bytes()
+    assert len(journal) >= 4 << 20
     assert b"\xa5" * 16 not in journal, "an old journal would be played back after a power cut"
-
-
-def _journal(reader: ImageReader) -> bytes:
-    place = reader.data.with_name("journal")
-    reader.debugfs(f"dump <8> {place}", reader.data)
-    data = place.read_bytes()
-    assert len(data) >= 4 << 20
-    return data
 
 
 def test_the_image_is_stored_without_its_empty_parts(image):
     assert image.stat().st_blocks * 512 < image.stat().st_size / 3
 
 
-def _break_tar(given, folder):
-    data = given.rootfs.read_bytes()
-    given.rootfs.write_bytes(data[: len(data) // 2])
-
-
-def _no_tar(given, folder):
-    given.rootfs.unlink()
-
-
-def _no_kernel(given, folder):
-    (given.kernel.boot / "vmlinuz").unlink()
-
-
-def _no_tables(given, folder):
-    (given.kernel.root / f"usr/lib/modules/{RELEASE}/modules.dep").unlink()
-
-
-def _no_overlay(given, folder):
-    (given.kernel.root / f"usr/lib/modules/{RELEASE}/modules.builtin").write_text("")
-
-
-def _fat_kernel(given, folder):
-    with open(given.kernel.boot / "vmlinuz", "wb") as file:
-        file.truncate(70 << 20)
+_TABLES = f"modules/usr/lib/modules/{RELEASE}"
 
 
 @pytest.mark.parametrize(
-    ("harm", "says"),
+    ("path", "harm", "says"),
     [
-        (_break_tar, "no readable tar"),
-        (_no_tar, "no readable tar"),
-        (_no_kernel, "no kernel 'vmlinuz'"),
-        (_no_tables, "no modules.dep"),
-        (_no_overlay, "no overlay, neither as a module nor built in"),
-        (_fat_kernel, r"BLIMPBOOT: contents need \d+ MiB and get 64 MiB"),
+        ("root.tar", lambda file: os.truncate(file, file.stat().st_size // 2), "no readable tar"),
+        ("root.tar", Path.unlink, "no readable tar"),
+        ("boot/vmlinuz", Path.unlink, "no kernel 'vmlinuz'"),
+        (f"{_TABLES}/modules.dep", Path.unlink, "no modules.dep"),
+        (
+            f"{_TABLES}/modules.builtin",
+            lambda file: os.truncate(file, 0),
+            "no overlay, neither as a module nor built in",
+        ),
+        (
+            "boot/vmlinuz",
+            lambda file: os.truncate(file, 70 << 20),
+            r"BLIMPBOOT: contents need \d+ MiB and get 64 MiB",
+        ),
     ],
 )
 def test_what_is_broken_or_too_big_is_one_line_and_the_old_image_stays(
-    harm, says, checkout, tmp_path
+    path, harm, says, checkout, tmp_path
 ):
     place = tmp_path / "out/blimp-qemu.img"
     place.parent.mkdir()
     place.write_bytes(b"the old one")
     given = make_ingredients(tmp_path / "in")
-    harm(given, tmp_path)
+    harm(tmp_path / "in" / path)
     with pytest.raises(DeployError, match=says) as failure:
         build(place, given, checkout, EPOCH)
     assert "\n" not in str(failure.value)

@@ -11,33 +11,28 @@ import dataclasses
 import functools
 import http.server
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from card_parts import EPOCH, ImageReader, make_checkout, missing_tools
+from card_parts import EPOCH, ImageReader, needs_tools
 from native_root import add_programs
 from raspios_base import make_tree, write_base
 from waiting import eventually
 
 from deploy.errors import DeployError
-from deploy.image import card, raspios
+from deploy.image import card, raspios, sparse
 from deploy.image.packages import apt, base
 from deploy.image.packages.board import Board, Group, load_board
 from deploy.run import run
 from tests.deploy.image.local_archive import TOOLS, Key, LocalArchive, need_tools, new_key
 
-pytestmark = [
-    pytest.mark.skipif(os.geteuid() != 0, reason="a chroot is root's"),
-    pytest.mark.skipif(
-        (lack := list(missing_tools())) != [], reason=f"not installed: {', '.join(lack)}"
-    ),
-]
+pytestmark = [pytest.mark.skipif(os.geteuid() != 0, reason="a chroot is root's"), needs_tools]
 
 _ROOT = Path(__file__).parents[3]
 _PYC = "usr/lib/python3/dist-packages/__pycache__/tool.cpython-313.pyc"
@@ -92,7 +87,7 @@ class Stand:
 
 
 @pytest.fixture(scope="module")
-def stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stand]:
+def stand(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Iterator[Stand]:
     need_tools(*TOOLS, "dpkg", "unshare")
     if subprocess.run(["unshare", "--mount", "true"], check=False, capture_output=True).returncode:
         pytest.skip("no mount namespace may be made here")
@@ -152,7 +147,7 @@ def stand(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stand]:
         tree.write("usr/bin/rival", "in the way", 0o755)
         tree.folder("usr/lib/tmpfiles.d", 0o1777, 2, 3)
         image = write_base(folder / "raspios.img", tree, 160 << 20)
-        yield Stand(board, archive, key, image, make_checkout(folder / "checkout"))
+        yield Stand(board, archive, key, image, checkout)
 
 
 @pytest.fixture(scope="module")
@@ -189,8 +184,7 @@ def test_what_was_missing_is_on_the_card_as_its_packages_made_it(reader: ImageRe
     assert not reader.exists("usr/share/doc/tool/README")
     assert reader.read("usr/share/doc/tool/copyright") == "free"
     assert reader.read(_PYC).encode() == b"3.13\1\0\0\0" + bytes(8) + b"code"
-    path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
-    subprocess.run(["e2fsck", "-fn", reader.root], check=True, env={**os.environ, "PATH": path})
+    reader.check()
 
 
 def test_the_plugins_that_stay_are_listed_by_the_card_s_own_programs(reader: ImageReader) -> None:
@@ -244,8 +238,11 @@ def test_nothing_of_the_work_is_left(reader: ImageReader) -> None:
     assert reader.read("etc/hostname") == "blimp\n"
 
 
-def test_the_manifest_has_the_versions_that_came(image: Path) -> None:
+def test_the_manifest_has_the_versions_that_came_and_the_base_as_it_still_is(
+    stand: Stand, image: Path
+) -> None:
     document = json.loads(card.beside(image, ".manifest.json").read_text())
+    assert document["base"] == {"name": stand.base.name, "sha256": sparse.sha256(stand.base)}
     versions = {row["name"]: row["version"] for row in document["packages"]}
     assert (versions["tool"], versions["helper"]) == ("2.0-1", "1.5")
     assert "rival" not in versions
@@ -331,34 +328,23 @@ def test_killed_in_the_middle_nothing_half_is_left(
     stand.archive.publish(stand.key)
     kept = {path: path.read_bytes() for path in cache.glob("*.tar")}
     place = tmp_path / "x.img"
-    program = (
-        "import dataclasses\n"
-        "from pathlib import Path\n"
-        "from deploy.image import raspios\n"
-        "from deploy.image.packages.board import Group, load_board\n"
-        f"board = dataclasses.replace(load_board('zerow'), packages=(Group('x', ({name!r},)),),\n"
-        f"    architecture={stand.board.architecture!r})\n"
-        f"places = {[str(path) for path in (place, stand.base, cache, stand.checkout)]}\n"
-        "image, base, cache, checkout = map(Path, places)\n"
-        f"raspios.build(image, board, base, None, cache, checkout, {EPOCH})\n"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", program], cwd=_ROOT, stderr=subprocess.DEVNULL
-    )
+    packages = (Group("for a test", (name,)),)
+    other = dataclasses.replace(stand, board=dataclasses.replace(stand.board, packages=packages))
+    process = multiprocessing.get_context("fork").Process(target=other.build, args=(place, cache))
+    process.start()
     try:
         here = ".base-*.part-*/root/tmp/here"
-        eventually(lambda: list(cache.glob(here)) or process.poll() is not None)
+        eventually(lambda: list(cache.glob(here)) or not process.is_alive())
         (work,) = cache.glob(".base-*.part-*")
     finally:
         process.kill()
-        assert process.wait(60) == -signal.SIGKILL
+        process.join(60)
+        assert process.exitcode == -signal.SIGKILL
     eventually(lambda: not _inside(work))
     assert {path: path.read_bytes() for path in cache.glob("*.tar")} == kept
     assert not place.exists() and work.exists()
     stand.archive.add(name, "2")
     stand.archive.publish(stand.key)
-    packages = (Group("for a test", (name,)),)
-    other = dataclasses.replace(stand, board=dataclasses.replace(stand.board, packages=packages))
     other.build(place, cache)
     assert len(_kept(cache)) == len(kept) + 1 and not work.exists()
 

@@ -106,41 +106,27 @@ def test_every_gstreamer_element_of_the_firmware_stays_on_the_card() -> None:
     assert gone - _WORDS <= _NOT_ON_A_CARD
 
 
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [
-        ('machine = "aarch64"', "machine: Field required"),
-        ('[kernel]\npackage = "k"', "'kernel' stands exactly where"),
-        ('image = "vmlinuz"', "kernel.image: Field required"),
-        ('names = ["v4l-utils"]', r"packages\.\d+\.names: Field required"),
-    ],
-)
-def test_a_key_that_is_missing_is_named(tmp_path: Path, change: str, complaint: str) -> None:
-    text = (BOARDS_FOLDER / "qemu.toml").read_text()
-    text = text.replace('"parts/', f'"{BOARDS_FOLDER}/parts/')
-    if change.startswith("[kernel]"):
-        text = text[: text.index("[kernel]")]
-    else:
-        assert change in text
-        text = text.replace(change, "")
-    (tmp_path / "own.toml").write_text(text)
-    with pytest.raises(DeployError, match=complaint):
-        load_board(tmp_path / "own.toml")
+_QEMU = (BOARDS_FOLDER / "qemu.toml").read_text()
 
 
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
+        ('machine = "aarch64"', "", "machine: Field required"),
+        (_QEMU[_QEMU.index("[kernel]") :], "", "'kernel' stands exactly where"),
+        ('image = "vmlinuz"', "", "kernel.image: Field required"),
+        ('names = ["v4l-utils"]', "", ".names: Field required"),
         ('machine = "', 'colour = "red"\nmachine = "', "colour: Unexpected keyword argument"),
         ('"v4l-utils"', "5", "names.0: Input should be a valid string"),
         ("[kernel]", "[kernel", "own.toml: "),
     ],
 )
-def test_a_value_that_is_wrong_is_named(tmp_path: Path, old: str, new: str, complaint: str) -> None:
-    text = (BOARDS_FOLDER / "qemu.toml").read_text()
-    text = text.replace('"parts/', f'"{BOARDS_FOLDER}/parts/')
-    assert old in text
-    (tmp_path / "own.toml").write_text(text.replace(old, new, 1))
+def test_a_key_that_is_missing_or_wrong_is_named(
+    tmp_path: Path, old: str, new: str, complaint: str
+) -> None:
+    assert old in _QEMU
+    text = _QEMU.replace(old, new, 1).replace('"parts/', f'"{BOARDS_FOLDER}/parts/')
+    (tmp_path / "own.toml").write_text(text)
     with pytest.raises(DeployError, match=re.escape(complaint)):
         load_board(tmp_path / "own.toml")
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -149,49 +150,43 @@ def test_without_root_it_is_one_line(
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_stopped_or_killed_it_leaves_nothing_half_made(
-    native: Board, calls: Path, tmp_path: Path, how: signal.Signals
+    native: Board,
+    calls: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    how: signal.Signals,
 ) -> None:
     """A second process waits for the first one's tar meanwhile, and then makes it."""
     if how == signal.SIGKILL:
         need_tools("setpriv")
-    place = {name: getattr(native.archives[0], name) for name in ("url", "keyring")}
-    program = (
-        "import dataclasses, os, signal, sys\n"
+    cache = tmp_path / "cache"
+
+    def build() -> None:
         # A suite that runs in the background inherits an ignored SIGINT; a person's shell does not.
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        "from pathlib import Path\n"
-        "from deploy.image.packages.board import load_board, with_archives\n"
-        "from deploy.image.packages.rootfs import build_rootfs\n"
-        "os.geteuid = lambda: 0\n"
-        "board = load_board('qemu')\n"
-        "group = dataclasses.replace(board.packages[0], names=('tool',))\n"
-        f"board = dataclasses.replace(board, architecture={native.architecture!r},\n"
-        "    packages=(group,), archives=board.archives[:1])\n"
-        f"board = with_archives(board, {{'debian': {place!r}}})\n"
-        "board = dataclasses.replace(board, archives=(dataclasses.replace(\n"
-        "    board.archives[0], suites=('trixie',), components=('main',)),))\n"
-        "try:\n"
-        f"    print(build_rootfs(board, Path({str(tmp_path / 'cache')!r}), {_EPOCH}))\n"
-        "except KeyboardInterrupt:\n"
-        "    sys.exit(130)\n"
-    )
-    environment = {**os.environ, "PYTHONPATH": str(_ROOT), "TAKES_S": "60"}
-    first = subprocess.Popen([sys.executable, "-c", program], env=environment, cwd=_ROOT)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            build_rootfs(native, cache, _EPOCH)
+        except KeyboardInterrupt:
+            sys.exit(130)
+
+    fork = multiprocessing.get_context("fork")
+    first, second = fork.Process(target=build), fork.Process(target=build)
+    monkeypatch.setenv("TAKES_S", "60")
+    first.start()
     eventually(calls.exists)
-    second = subprocess.Popen(
-        [sys.executable, "-c", program],
-        env={**environment, "TAKES_S": "0"},
-        cwd=_ROOT,
-        stdout=subprocess.PIPE,
-    )
+    monkeypatch.delenv("TAKES_S")
+    second.start()
     ((_, environment_of_first, _),) = json.loads(calls.read_text())
-    first.send_signal(how)
-    assert first.wait(60) == (130 if how == signal.SIGINT else -how)
+    assert first.pid is not None
+    os.kill(first.pid, how)
+    first.join(60)
+    assert first.exitcode == (130 if how == signal.SIGINT else -how)
     # The tool doesn't outlive it.
     eventually(lambda: not Path(f"/proc/{environment_of_first['pid']}").exists())
-    out, _ = second.communicate(timeout=60)
-    assert second.returncode == 0
-    assert _left(tmp_path / "cache") == [Path(out.decode().strip()).name]
+    second.join(60)
+    assert second.exitcode == 0
+    made = _left(cache)
+    assert len(made) == 1 and made == [build_rootfs(native, cache, _EPOCH).name]
 
 
 def test_nothing_of_one_machine_s_own_goes_onto_all_cards(tmp_path: Path) -> None:
