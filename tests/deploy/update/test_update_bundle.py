@@ -3,12 +3,12 @@
 import io
 import json
 import tarfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from card_stand import NEW, contents, tar_of
+from card_parts import commit, git
+from card_stand import NEW, contents, lay, tar_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -188,30 +188,31 @@ def test_the_same_release_and_key_give_the_same_bytes(release_key: Path) -> None
     assert [name for name, _ in read(one)] == ["manifest.json", "manifest.json.sig", *sorted(files)]
 
 
-def test_a_checkouts_release_is_what_git_tracks(tmp_path: Path, git: Callable[..., str]) -> None:
-    files = bundles.release_of(tmp_path, None, "aarch64", "3.13")
-    told = json.loads(files.pop("release.json"))
-    commit = git("rev-parse", "HEAD")[:12]
-    assert (told["version"], told["machine"]) == (f"0.3.0+git{commit}", "aarch64")
-    assert told["made"] == "2026-05-06T07:08:09Z"
-    assert set(files) == {"pi_firmware/__init__.py", "pi_firmware/__main__.py"}
-    manifest.parse(bundles.make(contents(told["version"]), _any_key(tmp_path)).manifest)
-
-
-def test_changes_without_a_commit_are_a_version_of_their_own(
-    tmp_path: Path, git: Callable[..., str]
+def test_a_release_is_what_git_tracks_and_what_no_commit_holds_a_version_of_its_own(
+    tmp_path: Path, release_key: Path
 ) -> None:
-    (tmp_path / "pi_firmware/__main__.py").write_text("print(2)\n")
-    one = json.loads(bundles.release_of(tmp_path, None, "a", "3.13")["release.json"])
-    again = json.loads(bundles.release_of(tmp_path, None, "a", "3.13")["release.json"])
-    (tmp_path / "pi_firmware/__main__.py").write_text("print(3)\n")
-    other = json.loads(bundles.release_of(tmp_path, None, "a", "3.13")["release.json"])
+    program = tmp_path / "pi_firmware/__main__.py"
+    project = b'[project]\nversion = "0.3.0"\n'
+    lay(tmp_path, {"pi_firmware/__main__.py": b"print(1)\n", "pyproject.toml": project})
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "add", "-A")
+    commit(tmp_path)
+    (tmp_path / "pi_firmware/untracked.py").touch()
+
+    def release() -> dict[str, str]:
+        files = bundles.release_of(tmp_path, None, "aarch64", "3.13")
+        assert set(files) == {"pi_firmware/__main__.py", "release.json"}
+        told: dict[str, str] = json.loads(files["release.json"])
+        manifest.parse(bundles.make(contents(told["version"]), release_key).manifest)
+        return told
+
+    told = release()
+    assert told["version"] == f"0.3.0+git{git(tmp_path, 'rev-parse', 'HEAD')[:12]}"
+    assert (told["machine"], told["made"]) == ("aarch64", "2025-10-09T08:53:20Z")
+    program.write_text("print(2)\n")
+    one, again = release(), release()
+    program.write_text("print(3)\n")
+    other = release()
     assert ".dirty." in one["version"] and one["version"] == again["version"] != other["version"]
-    assert one["made"] > "2026-05-06T07:08:09Z"
+    assert one["made"] > told["made"]
     assert manifest.read_release(one, "x").age <= manifest.read_release(other, "x").age
-
-
-def _any_key(folder: Path) -> Path:
-    from card_stand import make_key
-
-    return make_key(folder / "key")

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -76,40 +77,27 @@ def test_a_link_to_no_release_is_the_images(card: Card, target: str) -> None:
     assert card.choice().name == ""
 
 
-def damage(card: Card, name: str, what: str) -> None:
-    folder = card.at.folder(name)
-    if what == "cut file":
-        with (folder / "site/native.so").open("r+b") as file:
-            file.truncate(100)
-    elif what == "missing file":
-        (folder / "pi_firmware/__main__.py").unlink()
-    elif what == "no list":
-        (folder / "manifest.json").unlink()
-    elif what == "list of nonsense":
-        (folder / "manifest.json").write_text('{"files": [[1, 2], null]}')
-    elif what == "empty list":
-        (folder / "manifest.json").write_bytes(b"")
-    elif what == "a link in its place":
-        folder.rename(folder.with_name("7.0"))
-        folder.symlink_to("7.0")
+def replaced_by_a_link(folder: Path) -> None:
+    folder.rename(folder.with_name("7.0"))
+    folder.symlink_to("7.0")
 
 
-@pytest.mark.parametrize(
-    "what",
-    [
-        "cut file",
-        "missing file",
-        "no list",
-        "list of nonsense",
-        "empty list",
-        "a link in its place",
-    ],
-)
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "cut file": lambda folder: os.truncate(folder / "site/native.so", 100),
+    "missing file": lambda folder: (folder / "pi_firmware/__main__.py").unlink(),
+    "no list": lambda folder: (folder / "manifest.json").unlink(),
+    "nonsense": lambda folder: (folder / "manifest.json").write_text('{"files": [[1, 2], null]}'),
+    "empty list": lambda folder: os.truncate(folder / "manifest.json", 0),
+    "a link in its place": replaced_by_a_link,
+}
+
+
+@pytest.mark.parametrize("what", DAMAGES)
 def test_a_damaged_release_is_not_started(card: Card, what: str) -> None:
     card.take(card.bundle(contents(NEW)))
     card.at.trial.unlink()
     assert card.choice() == Choice(NEW, "update")
-    damage(card, NEW, what)
+    DAMAGES[what](card.at.folder(NEW))
     chosen = card.choice()
     assert (chosen.name, chosen.how) == ("", "fell back") and chosen.reason.startswith(NEW)
 
