@@ -29,6 +29,9 @@ class FastDisk(Disk):
     def _sync(self, descriptor: int) -> None:
         pass
 
+    def _sync_folder(self, folder: Path) -> None:
+        pass
+
 
 class CutDisk(FastDisk):
     """A disk whose power goes before the change of that number; counts them otherwise."""

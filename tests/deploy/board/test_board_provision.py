@@ -8,6 +8,7 @@ import stat
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from board_cards import BLIMP, KEY, PASSWORD, WIFI, Person, certificates, renamed
@@ -200,56 +201,37 @@ def test_a_cable_and_a_named_station(person: Person) -> None:
     assert not (person.card.blimp / "wpa_supplicant.conf").exists()
 
 
-WRONG: dict[str, tuple[bytes, dict[str, bytes], str]] = {
-    "blimp.toml: not valid TOML": (b"schema = ", certificates(), ""),
-    "blimp.toml: unknown key": (
-        b'schema = 1\nrocket = 1\n[payload]\nid = "a"\n',
-        certificates(),
-        "",
+# What a person gives, and the refusal; by themselves BLIMP and its certificates are right.
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"what": b"schema = "}, "blimp.toml: not valid TOML"),
+    ({"what": b'schema = 1\nrocket = 1\n[payload]\nid = "a"\n'}, "blimp.toml: unknown key"),
+    ({"what": b"#" * 300000}, "blimp.toml has more than 262144 bytes"),
+    ({"what": renamed("hall")}, "'wifi.password' is empty, and the card holds none"),
+    ({"keys": {}}, "certificates/ is missing: put the folder there"),
+    (
+        {"keys": {k: v for k, v in certificates().items() if k != "key.pem"}},
+        "certificates/ lacks key.pem",
     ),
-    "blimp.toml has more than 262144 bytes": (b"#" * 300000, certificates(), ""),
-    "'wifi.password' is empty, and the card holds none": (
-        render(renamed("hall")).encode(),
-        certificates(),
-        "",
+    (
+        {"keys": certificates("other")},
+        "certificates/ is of 'payload.other', and 'payload.id' is 'blimp-1'",
     ),
-    "certificates/ is missing: put the folder there": (render(BLIMP).encode(), {}, ""),
-    "certificates/ lacks key.pem": (
-        render(BLIMP).encode(),
-        {k: v for k, v in certificates().items() if k != "key.pem"},
-        "",
-    ),
-    "certificates/ is of 'payload.other', and 'payload.id' is 'blimp-1'": (
-        render(BLIMP).encode(),
-        certificates("other"),
-        "",
-    ),
-    "certificates/access.json is damaged": (
-        render(BLIMP).encode(),
-        {**certificates(), "access.json": b"[]"},
-        "",
-    ),
-    "certificates/ holds none of ca.pem": (render(BLIMP).encode(), {"readme.txt": b"?"}, ""),
-    "key.pem has more than 65536 bytes": (
-        render(BLIMP).encode(),
-        {**certificates(), "key.pem": b"k" * 70000},
-        "",
-    ),
-    "payload.toml: not valid TOML": (render(BLIMP).encode(), certificates(), "rate"),
-    "payload.toml: 'link' must be a table": (render(BLIMP).encode(), certificates(), "link = 5"),
-    "payload.toml: 'camera.when' is a date": (
-        render(BLIMP).encode(),
-        certificates(),
-        "[camera]\nwhen = 2026-01-01\n",
-    ),
-}
+    ({"keys": certificates() | {"access.json": b"[]"}}, "certificates/access.json is damaged"),
+    ({"keys": {"readme.txt": b"?"}}, "certificates/ holds none of ca.pem"),
+    ({"keys": certificates() | {"key.pem": b"k" * 70000}}, "key.pem has more than 65536 bytes"),
+    ({"settings": "rate"}, "payload.toml: not valid TOML"),
+    ({"settings": "link = 5"}, "payload.toml: 'link' must be a table"),
+    ({"settings": "[camera]\nwhen = 2026-01-01\n"}, "payload.toml: 'camera.when' is a date"),
+]
 
 
-@pytest.mark.parametrize("told", WRONG)
-def test_what_is_wrong_is_refused_and_the_old_stays_in_force(person: Person, told: str) -> None:
-    text, keys, settings = WRONG[told]
+@pytest.mark.parametrize(("given", "told"), WRONG)
+def test_what_is_wrong_is_refused_and_the_old_stays_in_force(
+    person: Person, given: dict[str, Any], told: str
+) -> None:
+    given = {"keys": certificates(), **given}
     fresh = Person(person.card.root / "fresh")
-    fresh.gives(text, keys, settings)
+    fresh.gives(**given)
     before = fresh.state()
     outcome = fresh.boots()
     assert outcome.state == "refused" and outcome.payload_id == ""
@@ -261,7 +243,7 @@ def test_what_is_wrong_is_refused_and_the_old_stays_in_force(person: Person, tol
     held = {k: v for k, v in person.state().items() if k.startswith("data")}
     if told.startswith(("'wifi.password", "certificates/ is missing")):
         return  # the card has those by now
-    person.gives(text, keys, settings)
+    person.gives(**given)
     outcome = person.boots()
     assert (outcome.state, outcome.payload_id) == ("refused", "blimp-1") and told in outcome.reason
     assert {k: v for k, v in person.state().items() if k.startswith("data")} == held
