@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import lzma
 import shutil
@@ -203,7 +204,7 @@ def test_a_packed_image_is_the_same(bench: Bench) -> None:
     packed = bench.folder / (bench.image.name + ".xz")
     packed.write_bytes(lzma.compress(bench.image.read_bytes(), preset=0))
     bench.image.rename(bench.folder / "unpacked")
-    words = [str(packed) if word == str(bench.image) else word for word in bench.command()]
+    words = dataclasses.replace(bench, image=packed).command()
     done = run(words)  # checked by the checksum and the map of what is in it
     assert done.returncode == 0, done.stderr
     image, card = (bench.folder / "unpacked").read_bytes(), bench.card.read_bytes()
@@ -260,10 +261,9 @@ def test_an_image_with_a_fat32_and_odd_names_works(bench: Bench) -> None:
     plain = bench.folder / "plain"  # mtools itself cannot take such a name
     make_image(plain, boot_mib=40)
     plain.rename(odd)
-    words = [str(odd) if word == str(bench.image) else word for word in bench.command()]
     card = bench.folder / "-i @@ card.img"
     card.write_bytes(bytes(odd.stat().st_size))
-    words = [f"{card}" if word == str(bench.card) else word for word in words]
+    words = dataclasses.replace(bench, image=odd, card=card).command()
     refused(words, "--no-checksum")
     done = run([*words, "--no-checksum"])
     assert done.returncode == 0, done.stderr

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import shutil
@@ -39,7 +40,7 @@ def test_a_wrong_or_missing_checksum(untouched: Bench) -> None:
 def test_a_card_that_is_too_small(untouched: Bench) -> None:
     small = untouched.folder / "small"
     small.write_bytes(b"o" * (untouched.image.stat().st_size - 512))
-    words = [str(small) if word == str(untouched.card) else word for word in untouched.command()]
+    words = dataclasses.replace(untouched, card=small).command()
     refused(words, f"the image needs {untouched.image.stat().st_size}", program=True)
     assert small.read_bytes().count(b"o") == small.stat().st_size
 
@@ -54,7 +55,7 @@ def test_an_image_that_is_not_ours_or_for_another_board(untouched: Bench) -> Non
 
     def words() -> list[str]:
         sum_of(other)
-        return [str(other) if w == str(untouched.image) else w for w in untouched.command()]
+        return dataclasses.replace(untouched, image=other).command()
 
     make_image(other, label="SOMEBODY")
     refused(words(), "its boot partition is not BLIMPBOOT")

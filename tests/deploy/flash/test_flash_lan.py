@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -40,15 +41,23 @@ def namespaces() -> list[str]:
     return command
 
 
-@pytest.fixture
-def card(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Card:
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Where the person at the station has their keys."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_DATA_HOME", str(tmp_path_factory.mktemp("share")))
+        yield Path(os.environ["XDG_DATA_HOME"])
+
+
+@pytest.fixture(scope="module")
+def card(data: Path, shared_image: Path, tmp_path_factory: pytest.TempPathFactory) -> Card:
     """A board's card after its first start; keys and flasher by the commands a person types."""
-    data = tmp_path / "share"
-    monkeypatch.setenv("XDG_DATA_HOME", str(data))
+    tmp_path = tmp_path_factory.mktemp("card")
+    bench = Bench(tmp_path, shared_image, tmp_path / "card", data / "blimp/keys")
+    bench.card.write_bytes(bytes(shared_image.stat().st_size))
     for words in (["init"], ["ground", "main"], ["payload", "blimp-1"]):
         done = run([BLIMP, "keys", *words], program=True)
         assert done.returncode == 0, done.stderr
-    bench.keys = data / "blimp/keys"
     done = run(bench.command())
     assert done.returncode == 0, done.stderr
     card = Card(tmp_path / "board")
@@ -93,10 +102,10 @@ def test_a_flashed_card_reaches_serve_lan(
 
 
 def test_a_flashed_card_reaches_a_station_set_by_the_block_of_station_toml(
-    namespaces: list[str], card: Card, tmp_path: Path
+    namespaces: list[str], card: Card, data: Path, tmp_path: Path
 ) -> None:
     block = "\n".join(re.findall(r"^#   (.+)$", SHIPPED.read_text(), re.MULTILINE))
-    certificates = Path(os.environ["XDG_DATA_HOME"]) / "blimp/keys/ground/main"
+    certificates = data / "blimp/keys/ground/main"
     block = block.replace("/etc/blimp/certificates", str(certificates)).replace("wlan0", "ground0")
     config = tmp_path / "station.toml"
     config.write_text(block)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import stat
@@ -117,14 +118,14 @@ def test_the_disk_that_this_machine_runs_on_is_refused() -> None:
 
 
 def test_the_program_says_what_is_no_card(bench: Bench) -> None:
-    def device(path: str) -> list[str]:
-        return [path if word == str(bench.card) else word for word in bench.command()]
+    def device(path: Path) -> list[str]:
+        return dataclasses.replace(bench, card=path).command()
 
-    refused(device("/dev/null"), "neither a disk nor an image file", program=True)
-    refused(device(str(bench.folder)), "neither a disk nor an image file")
-    refused(device(str(bench.folder / "none")), "truncate -s 8G")
-    refused(device("/dev/no-such-card"), "No such file or directory")
-    refused(device(str(bench.image)), "the image itself")
+    refused(device(Path("/dev/null")), "neither a disk nor an image file", program=True)
+    refused(device(bench.folder), "neither a disk nor an image file")
+    refused(device(bench.folder / "none"), "truncate -s 8G")
+    refused(device(Path("/dev/no-such-card")), "No such file or directory")
+    refused(device(bench.image), "the image itself")
 
 
 @pytest.fixture
@@ -151,11 +152,11 @@ def test_a_real_device_that_is_mounted_or_fixed_is_refused(
 ) -> None:
     device, file = loop
     before = file.read_bytes()
-    words = [device if word == str(bench.card) else word for word in bench.command()]
+    at_loop = dataclasses.replace(bench, card=Path(device))
+    words, name = at_loop.command(), Path(device).name
     refused(words, "is a fixed disk (not removable)")
-    refused([*bench.customise()[:-1], "--device", device], "is a fixed disk")
-    name = Path(device).name
-    refused([str(file) if word == device else word for word in words], f"in use as /dev/{name}")
+    refused(at_loop.customise(), "is a fixed disk")
+    refused(dataclasses.replace(bench, card=file).command(), f"in use as /dev/{name}")
     point = bench.folder / "mounted here"
     point.mkdir()
     mounted = subprocess.run(["mount", "-o", "ro", device, point], check=False)
