@@ -35,14 +35,10 @@ def refusal(tmp_path: Path, text: str) -> str:
     return line
 
 
-def test_a_part_without_a_source_is_refused(tmp_path: Path) -> None:
-    line = refusal(tmp_path, GOOD.replace('source = "estimated"\n', ""))
-    assert "'brick' has no source; allowed: datasheet, measured, estimated" in line
-
-
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
+        ('source = "estimated"', "", "has no source; allowed: datasheet, measured, estimated"),
         ('source = "estimated"', 'source = "hearsay"', "'source' is 'hearsay'; allowed:"),
         ('citation = "by eye"', 'citation = " "', "it has no citation"),
         ("spread_g = 3.0", "spread_g = 1.0", "a spread of 1 g; allowed: 2 g and more"),
