@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,7 @@ import pytest
 from deploy.errors import DeployError
 from deploy.image.packages import apt
 from deploy.image.packages.board import Board, load_board, with_archives
-from tests.deploy.image.local_archive import TOOLS, Key, LocalArchive, need_tools, new_key
+from tests.deploy.image.local_archive import Key, LocalArchive
 
 _ONLY = ("linux-image-*", "raspi-firmware")
 
@@ -26,14 +25,6 @@ class Shelf:
     debian_key: Key
     pi_key: Key
     board: Board
-
-
-@pytest.fixture(scope="module")
-def keys(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Key, Key]]:
-    need_tools(*TOOLS)
-    folder = tmp_path_factory.mktemp("keys")
-    with new_key(folder, "debian") as debian, new_key(folder, "pi") as pi:
-        yield debian, pi
 
 
 @pytest.fixture

@@ -30,7 +30,7 @@ from deploy.image import card, raspios, sparse
 from deploy.image.packages import apt, base
 from deploy.image.packages.board import Board, Group, load_board
 from deploy.run import run
-from tests.deploy.image.local_archive import TOOLS, Key, LocalArchive, need_tools, new_key
+from tests.deploy.image.local_archive import Key, LocalArchive, need_tools
 
 pytestmark = [pytest.mark.skipif(os.geteuid() != 0, reason="a chroot is root's"), needs_tools]
 
@@ -87,22 +87,20 @@ class Stand:
 
 
 @pytest.fixture(scope="module")
-def stand(tmp_path_factory: pytest.TempPathFactory, checkout: Path) -> Iterator[Stand]:
-    need_tools(*TOOLS, "dpkg", "unshare")
+def stand(
+    tmp_path_factory: pytest.TempPathFactory, checkout: Path, keys: tuple[Key, Key]
+) -> Iterator[Stand]:
+    need_tools("dpkg", "unshare")
     if subprocess.run(["unshare", "--mount", "true"], check=False, capture_output=True).returncode:
         pytest.skip("no mount namespace may be made here")
     architecture = run(["dpkg", "--print-architecture"]).decode().strip()
-    folder = tmp_path_factory.mktemp("stand")
+    folder, key = tmp_path_factory.mktemp("stand"), keys[0]
     board = dataclasses.replace(
         load_board("zerow"),
         architecture=architecture,
         packages=(Group("for a test", ("base-files", "helper", "tool")),),
     )
-    with (
-        new_key(folder, "base") as key,
-        _served(folder / "archive") as url,
-        pytest.MonkeyPatch.context() as patch,
-    ):
+    with _served(folder / "archive") as url, pytest.MonkeyPatch.context() as patch:
         # Small, and no waiting for an archive that was taken away on purpose.
         patch.setitem(card.BOOT_BYTES, "zerow", 40 << 20)
         # Of this machine, and nowhere in the base.
@@ -288,11 +286,10 @@ def _broken(stand: Stand, how: str, another: Key) -> Iterator[None]:
 
 @pytest.mark.parametrize("how", ["another", "away"])
 def test_an_archive_out_of_reach_or_not_signed_by_its_key_is_one_line(
-    stand: Stand, how: str, tmp_path: Path
+    stand: Stand, keys: tuple[Key, Key], how: str, tmp_path: Path
 ) -> None:
     with (
-        new_key(tmp_path, "another") as another,
-        _broken(stand, how, another),
+        _broken(stand, how, keys[1]),
         pytest.raises(DeployError, match=r"^packages of zerow: .*127\.0\.0\.1") as caught,
     ):
         stand.build(tmp_path / "out/x.img", tmp_path / "cache")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,7 @@ import pytest
 from deploy.errors import DeployError
 from deploy.image.packages.board import Board, load_board
 from deploy.image.packages.kernel import unpack_kernel, with_dependencies
-from tests.deploy.image.local_archive import TOOLS, LocalArchive, need_tools, new_key
+from tests.deploy.image.local_archive import Key, LocalArchive, need_tools
 
 _VERSION = "6.12.1+rpt-rpi-v8"
 _TREES = f"usr/lib/linux-image-{_VERSION}"
@@ -70,17 +69,14 @@ def _packages(archive: LocalArchive) -> None:
 
 
 @pytest.fixture(scope="module")
-def board(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Board]:
-    need_tools(*TOOLS, "depmod")
-    folder = tmp_path_factory.mktemp("archive")
-    with new_key(folder, "pi") as key:
-        archive = LocalArchive(folder / "pi", "Raspberry Pi Foundation")
-        _packages(archive)
-        archive.publish(key)
-        only = ("linux-image-*", "raspi-firmware")
-        yield dataclasses.replace(
-            load_board("zero2w"), archives=(archive.archive("raspberrypi", key, only),)
-        )
+def board(tmp_path_factory: pytest.TempPathFactory, keys: tuple[Key, Key]) -> Board:
+    need_tools("depmod")
+    archive = LocalArchive(tmp_path_factory.mktemp("archive") / "pi", "Raspberry Pi Foundation")
+    _packages(archive)
+    archive.publish(keys[0])
+    only = ("linux-image-*", "raspi-firmware")
+    archives = (archive.archive("raspberrypi", keys[0], only),)
+    return dataclasses.replace(load_board("zero2w"), archives=archives)
 
 
 def _choose(board: Board, **changes: object) -> Board:

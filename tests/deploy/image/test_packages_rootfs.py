@@ -13,7 +13,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,7 +22,7 @@ from deploy.errors import DeployError
 from deploy.image.packages.board import Board, load_board
 from deploy.image.packages.rootfs import build_rootfs
 from deploy.run import run
-from tests.deploy.image.local_archive import TOOLS, LocalArchive, need_tools, new_key
+from tests.deploy.image.local_archive import Key, LocalArchive, need_tools
 
 _ROOT = Path(__file__).parents[3]
 _EPOCH = 1_767_225_600
@@ -51,22 +50,20 @@ pathlib.Path(sys.argv[-2]).write_bytes(b"TAR")
 
 
 @pytest.fixture(scope="module")
-def native(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Board]:
+def native(tmp_path_factory: pytest.TempPathFactory, keys: tuple[Key, Key]) -> Board:
     """A board of this machine's own architecture, with one package in a signed archive."""
-    need_tools(*TOOLS, "dpkg")
+    need_tools("dpkg")
     architecture = run(["dpkg", "--print-architecture"]).decode().strip()
-    folder = tmp_path_factory.mktemp("archive")
-    with new_key(folder, "debian") as key:
-        archive = LocalArchive(folder / "debian", "Debian", architecture)
-        archive.add("tool", "1.0")
-        archive.publish(key)
-        board = load_board("qemu")
-        yield dataclasses.replace(
-            board,
-            architecture=architecture,
-            archives=(archive.archive("debian", key),),
-            packages=(dataclasses.replace(board.packages[0], names=("tool",)),),
-        )
+    archive = LocalArchive(tmp_path_factory.mktemp("archive") / "debian", "Debian", architecture)
+    archive.add("tool", "1.0")
+    archive.publish(keys[0])
+    board = load_board("qemu")
+    return dataclasses.replace(
+        board,
+        architecture=architecture,
+        archives=(archive.archive("debian", keys[0]),),
+        packages=(dataclasses.replace(board.packages[0], names=("tool",)),),
+    )
 
 
 @pytest.fixture
