@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,10 +25,13 @@ analyze = pytest.mark.skipif(
 )
 
 
+def ran(*words: object, **how: Any) -> subprocess.CompletedProcess[str]:
+    command = list(map(str, words))
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, **how)
+
+
 def service(*arguments: object, source: Path = ROOT) -> subprocess.CompletedProcess[str]:
-    script = source / "deploy/ground_station/service.sh"
-    command = ["sh", str(script), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+    return ran("sh", source / "deploy/ground_station/service.sh", *arguments)
 
 
 def install(root: Path, source: Path) -> subprocess.CompletedProcess[str]:
@@ -157,20 +161,10 @@ def test_no_web_page_and_no_other_user_gets_in(root: Path, checkout: Path) -> No
 def test_the_installed_command_runs_its_own_release(installed: Path, tmp_path: Path) -> None:
     # What lies about where it is called, or is named in the environment, is not imported.
     (tmp_path / "ground_station.py").write_text("raise SystemExit('the wrong one')")
-    run = subprocess.run(
-        [
-            installed / "opt/blimp/current/bin/blimp",
-            "serve",
-            "--check",
-            "--map",
-            installed / "var/lib/blimp/maps/atrium",
-        ],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    command, atrium = "opt/blimp/current/bin/blimp", "var/lib/blimp/maps/atrium"
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    words = (installed / command, "serve", "--check", "--map", installed / atrium)
+    run = ran(*words, cwd=tmp_path, env=environment)
     assert (run.returncode, run.stdout.splitlines()[0]) == (0, "configuration is good"), run.stderr
 
 
@@ -253,24 +247,15 @@ def test_systemd_finds_nothing_wrong_with_the_unit(installed: Path, tmp_path: Pa
         shutil.copy(installed / name, root / name)
     units = Path("/usr/lib/systemd/system")
     shutil.copytree(units, root / "usr/lib/systemd/system", symlinks=True)
-    run = subprocess.run(
-        ["systemd-analyze", "verify", "--man=no", f"--root={root}", UNIT],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    run = ran("systemd-analyze", "verify", "--man=no", f"--root={root}", UNIT)
     about_it = [line for line in run.stderr.splitlines() if "blimp" in line]
     assert (run.returncode, about_it) == (0, []), run.stderr
 
 
 @analyze
 def test_the_unit_s_exposure_is_low() -> None:
-    run = subprocess.run(
-        ["systemd-analyze", "security", "--offline=true", "--no-pager", SCRIPT.with_name(UNIT)],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    words = ("systemd-analyze", "security", "--offline=true", "--no-pager")
+    run = ran(*words, SCRIPT.with_name(UNIT))
     match = re.search(r"Overall exposure level for \S+: ([0-9.]+)", run.stdout)
     assert match, run.stdout + run.stderr
     assert float(match[1]) < 2.0  # of 10; systemd calls less than 5 OK
@@ -278,5 +263,5 @@ def test_the_unit_s_exposure_is_low() -> None:
 
 @pytest.mark.skipif(shutil.which("shellcheck") is None, reason="shellcheck is not installed")
 def test_shellcheck_finds_nothing() -> None:
-    run = subprocess.run(["shellcheck", SCRIPT], capture_output=True, text=True, timeout=60)
+    run = ran("shellcheck", SCRIPT)
     assert run.returncode == 0, run.stdout
