@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import socket
 import struct
@@ -117,8 +116,3 @@ class Manager:
         except TimeoutError:
             return "", 0
         return line.decode(), _CREDENTIALS.unpack(control[0][2])[0]
-
-
-def environment(more: Mapping[str, str]) -> dict[str, str]:
-    """This process's, without what a test's own runner set for Python."""
-    return {**os.environ, **more}

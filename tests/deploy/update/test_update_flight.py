@@ -2,6 +2,7 @@
 back by itself, and telemetry says why."""
 
 import json
+import os
 import sys
 import threading
 from collections.abc import Iterator
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from card_stand import CHECKOUT, MADE, NEW, NOW, Card, lay, release_json
-from manager import Manager, environment
+from manager import Manager
 from receiving import Receiver
 
 from deploy.board.releases import watch
@@ -51,7 +52,7 @@ class Flight:
             f"[telemetry]\nconnect = {json.dumps(list(self.listener.endpoints))}\n"
         )
         command = [sys.executable, "-m", "deploy.board.start", "--root", str(card.root)]
-        variables = environment({"PYTHONPATH": str(CHECKOUT)})
+        variables = {**os.environ, "PYTHONPATH": str(CHECKOUT)}
         self.manager = Manager(command, variables, tmp_path)
         card.service = self.manager  # type: ignore[assignment]
         stack.enter_context(self.manager)

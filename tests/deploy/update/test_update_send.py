@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -76,8 +76,8 @@ class Stand:
     def behave(self, shown: str) -> None:
         (self.card.root / "systemctl.show").write_text(shown)
 
-    def update(self, *more: object) -> subprocess.CompletedProcess[str]:
-        """The command in this process, and what it says."""
+    def update(self, *more: object, keys: bool = False) -> subprocess.CompletedProcess[str]:
+        """The command in this process, and what it says; `keys`: asks `blimp keys`, too."""
         given = ["--payload", "blimp-1", "--keys", self.keys, "--site", self.site]
         words = ["update", *map(str, [*given, "--host", "192.0.2.1", *more])]
         with (
@@ -86,12 +86,18 @@ class Stand:
             mock.patch.dict(os.environ, self.environment),
             mock.patch.object(sys, "argv", words),
             mock.patch.object(remote, "_POLL_S", 0.1),
+            mock.patch.object(bundles, "release_key", bundles.release_key if keys else _first_key),
         ):
             try:
                 status = command.main()
             except SystemExit as end:
                 status = int(str(end.code))
         return subprocess.CompletedProcess(words, status, stdout.getvalue(), stderr.getvalue())
+
+
+def _first_key(keys: Path, log: Callable[[str], None]) -> Path:
+    """What `blimp keys` says of an authority that was never rotated, without its start."""
+    return keys / "releases/1"
 
 
 def authority(folder: Path) -> Path:
@@ -118,7 +124,7 @@ def stand(tmp_path: Path, card: Card, own_keys: Path) -> Stand:
 
 
 def test_a_checkout_comes_into_force(stand: Stand) -> None:
-    done = stand.update()
+    done = stand.update(keys=True)
     assert done.returncode == 0, done.stderr
     lines = done.stderr.splitlines()
     assert lines[0] == f"update: blimp-1 (zero2w) runs {OLDEST}"
@@ -189,7 +195,7 @@ def test_a_payload_that_is_not_there_is_one_line(stand: Stand) -> None:
     ],
 )
 def test_bad_input_is_one_line(stand: Stand, given: list[str], said: str) -> None:
-    done = stand.update(*given)
+    done = stand.update(*given, keys=True)
     assert done.returncode == 2 and any(part in done.stderr for part in said.split("|"))
     assert not (stand.card.root / "asked").exists()
 
