@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 from board_cards import Cut, CutDisk, Person, certificates, renamed
@@ -35,22 +35,31 @@ def settings_only(person: Person) -> None:
     person.gives((person.card.boot / "blimp.toml").read_bytes(), settings="[gate]\n")
 
 
+def cut_at_each_change(
+    people: Callable[[], Person], given: Callable[[Person], None]
+) -> Iterator[Person]:
+    """A card after its power went before the first change, before the second, and so on."""
+    count, whole = CutDisk(), people()
+    given(whole)
+    assert whole.boots(count).state == "in force"
+    assert count.steps > 15
+    for step in range(count.steps):
+        person = people()
+        given(person)
+        with pytest.raises(Cut):
+            person.boots(CutDisk(step))
+        yield person
+
+
 @pytest.mark.parametrize("given", [again, longer, settings_only])
 def test_the_next_boot_comes_to_the_same(
     people: Callable[[], Person], given: Callable[[Person], None]
 ) -> None:
     whole = people()
     given(whole)
-    count = CutDisk()
-    assert whole.boots(count).state == "in force"
+    whole.boots()
     wanted = relative(whole)
-    assert count.steps > 15
-
-    for step in range(count.steps):
-        person = people()
-        given(person)
-        with pytest.raises(Cut):
-            person.boots(CutDisk(step))
+    for step, person in enumerate(cut_at_each_change(people, given)):
         outcome = person.boots()
         assert (outcome.state, outcome.payload_id, outcome.reason) == ("in force", "blimp-1", "")
         assert relative(person) == wanted, f"power went before change {step}"
@@ -75,15 +84,7 @@ def test_power_goes_at_every_boot_once_more(people: Callable[[], Person]) -> Non
 
 def test_something_whole_is_in_force_at_every_moment(people: Callable[[], Person]) -> None:
     """What the firmware would find after a cut and a boot whose new file is refused, too."""
-    count = CutDisk()
-    whole = people()
-    again(whole)
-    whole.boots(count)
-    for step in range(count.steps):
-        person = people()
-        again(person)
-        with pytest.raises(Cut):
-            person.boots(CutDisk(step))
+    for person in cut_at_each_change(people, again):
         person.gives(b"nonsense")
         outcome = person.boots()
         assert outcome.state == "refused"
@@ -97,15 +98,7 @@ def test_a_persons_edit_between_two_boots_is_never_overwritten(
     people: Callable[[], Person],
 ) -> None:
     """The card was taken out after a power cut, and changed on a laptop."""
-    count = CutDisk()
-    whole = people()
-    first(whole)
-    whole.boots(count)
-    for step in range(count.steps):
-        person = people()
-        first(person)
-        with pytest.raises(Cut):
-            person.boots(CutDisk(step))
+    for person in cut_at_each_change(people, first):
         other = certificates(mark="3")
         person.gives(render(renamed("edited", "and once more")).encode(), keys=other)
         assert person.boots().fresh
