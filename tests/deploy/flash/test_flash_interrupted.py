@@ -50,11 +50,7 @@ def _flash(bench: Bench, fault: Callable[[str, int, bytes], bytes]) -> None:
         assert isinstance(target, Faulty)
         target.fault = fault  # type: ignore[method-assign]
         boot = BootPartition.at(target.fileno(), card.boot.offset, "card")
-        write.write(card, target, lambda: _customised(target, boot, content))
-
-
-def _customised(target: Target, boot: BootPartition, content: Content) -> None:
-    customise.customise(target, boot, content)
+        write.write(card, target, lambda: customise.customise(target, boot, content))
 
 
 def _sector(bench: Bench, number: int = 0) -> bytes:
@@ -348,7 +344,7 @@ def test_a_real_device_is_written_and_read_back(bench: Bench) -> None:
             with pytest.raises(DeployError, match="in use by the system or another program"):
                 Target.open(device)
             boot = BootPartition.at(target.fileno(), card.boot.offset, "card")
-            write.write(card, target, lambda: _customised(target, boot, content))
+            write.write(card, target, lambda: customise.customise(target, boot, content))
             target.reread_table()
         tool("blockdev", "--flushbufs", str(device))
     finally:
