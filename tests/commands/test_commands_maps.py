@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
 import pytest
+from hand_made import run
 
 from ground_station.cli import main
 from ground_station.commands import maps
@@ -16,14 +16,8 @@ from pi_firmware.wire.errors import ConfigError
 ROOT = Path(__file__).parents[2]
 
 
-def _run(*words: object) -> int:
-    parser = argparse.ArgumentParser()
-    maps.add_arguments(parser)
-    return maps.run(parser.parse_args([str(word) for word in words]))
-
-
 def test_info_says_what_a_map_holds(built, tmp_path, capsys):
-    assert _run("info", built.folder, "--json", tmp_path / "info.json") == 0
+    assert run(maps, "info", built.folder, "--json", tmp_path / "info.json") == 0
     document = json.loads((tmp_path / "info.json").read_text())
     assert document["images"] == 16 and document["landmarks"] == len(built.map.landmarks)
     assert document["frame"] == "sfm" and document["registration"] == "none"
@@ -76,7 +70,7 @@ def test_bad_input_gets_one_line(tmp_path, monkeypatch, camera_file, arguments, 
     _images(tmp_path / "tall", 2, (320, 240))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(error, match=words) as caught:
-        _run("build", *arguments, "--out", "map")
+        run(maps, "build", *arguments, "--out", "map")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "map").exists() and not (tmp_path / "map.part").exists()
 
@@ -89,24 +83,24 @@ def test_keyframes_of_long_inputs_are_taken_and_it_is_said(
     settings.write_text("max_images = 4\nmax_features = 50\n")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(MapError, match="no two of the 6 images"):  # the flag goes before the file
-        _run("build", "many", "--camera", camera_file, "--settings", settings, "--out", "map",
-             "--max-images", 6)  # fmt: skip
+        run(maps, "build", "many", "--camera", camera_file, "--settings", settings, "--out", "map",
+            "--max-images", 6)  # fmt: skip
     capsys.readouterr()
     # Noise: none shows what another does, so all nine are due, and they are thinned.
     with pytest.raises(MapError, match="no two of the 4 images"):
-        _run("build", "many", "--camera", camera_file, "--settings", settings, "--out", "map")
+        run(maps, "build", "many", "--camera", camera_file, "--settings", settings, "--out", "map")
     said = capsys.readouterr().out
     assert "9 frames; 4 keyframes are used of 9 that were due" in said and "max_images is 4" in said
     with pytest.raises(MapError, match="no two of the 9 images"):  # a step is meant as it stands
-        _run("build", "many", "--camera", camera_file, "--settings", settings,
-             "--out", "map", "--range", "::1")  # fmt: skip
+        run(maps, "build", "many", "--camera", camera_file, "--settings", settings,
+            "--out", "map", "--range", "::1")  # fmt: skip
 
 
 def test_a_build_without_a_camera_says_which_lens_it_starts_with(tmp_path, monkeypatch, capsys):
     _images(tmp_path / "two", 2)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(MapError, match="no two of the 2 images overlap"):
-        _run("build", "two", "--out", "map")
+        run(maps, "build", "two", "--out", "map")
     assert "a focal length of 473 px is guessed" in capsys.readouterr().out
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hand_made import run
 from rooms_map import two_rooms
 
 from ground_station.errors import GroundStationError
@@ -173,12 +173,9 @@ def test_an_unregistered_map_promises_no_metres(pages):
 
 
 def test_the_command_writes_page_and_figures(built, tmp_path, capsys):
-    parser = argparse.ArgumentParser()
-    view_command.add_arguments(parser)
-    out = tmp_path / "room.html"
-    shown, figures_file = [str(built.folder), "--out", str(out)], tmp_path / "f.json"
-    words = [*shown, "--headings", "4", "--json", str(figures_file)]
-    assert view_command.run(parser.parse_args(words)) == 0
+    out, figures_file = tmp_path / "room.html", tmp_path / "f.json"
+    words = [built.folder, "--out", out, "--headings", 4, "--json", figures_file]
+    assert run(view_command, *words) == 0
     assert f"Map {built.map.info.name}" in out.read_text(encoding="utf-8")
     figures = json.loads(figures_file.read_text())["localizability"]
     assert figures["headings"] == 4 and 0 < figures["share_lost"] <= 1
@@ -187,4 +184,4 @@ def test_the_command_writes_page_and_figures(built, tmp_path, capsys):
     # It is not registered: no name of a figure says metres.
     assert not [name for name in figures if name.endswith("_m")] and "_m " not in said
     with pytest.raises(GroundStationError, match="its folder does not exist"):
-        view_command.run(parser.parse_args([shown[0], "--out", str(tmp_path / "a" / "b.html")]))
+        run(view_command, built.folder, "--out", tmp_path / "a" / "b.html")

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
-
 import numpy as np
 import pytest
+from hand_made import run
 from rooms_map import SIGMA_M, two_rooms
 
 from ground_station.errors import GroundStationError
@@ -70,19 +69,15 @@ def test_a_folder_that_is_not_there_is_said(tmp_path):
 
 
 def test_the_command_writes_a_built_map(built, tmp_path, capsys):
-    parser = argparse.ArgumentParser()
-    export_command.add_arguments(parser)
     out = tmp_path / "room.ply"
-    assert export_command.run(parser.parse_args([str(built.folder), "--ply", str(out)])) == 0
+    assert run(export_command, built.folder, "--ply", out) == 0
     assert len(read_ply(out.read_bytes())[1]) == len(built.map.landmarks)
     assert "arbitrary units" in capsys.readouterr().out
 
 
 def test_the_command_writes_a_picture_and_asks_what_is_to_be_written(built, tmp_path, capsys):
-    parser = argparse.ArgumentParser()
-    export_command.add_arguments(parser)
     out = tmp_path / "room.png"
-    assert export_command.run(parser.parse_args([str(built.folder), "--png", str(out)])) == 0
+    assert run(export_command, built.folder, "--png", out) == 0
     assert out.read_bytes().startswith(b"\x89PNG") and "arbitrary" in capsys.readouterr().out
     with pytest.raises(GroundStationError, match="--ply or --png is needed"):
-        export_command.run(parser.parse_args([str(built.folder)]))
+        run(export_command, built.folder)

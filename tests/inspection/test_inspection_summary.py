@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 
 import numpy as np
 import pytest
+from hand_made import run
 from rooms_map import SIGMA_M, two_rooms
 
 from ground_station.inspection import command
@@ -51,12 +51,10 @@ def test_info_says_where_one_gets_lost_when_asked(tmp_path, capsys):
     folder = tmp_path / "rooms"
     folder.mkdir()
     store.save_tables(folder, two_rooms())
-    parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
-    words = [str(folder), "--localizability", "--json", str(tmp_path / "info.json")]
-    assert command.run(parser.parse_args(words)) == 0
-    document = json.loads((tmp_path / "info.json").read_text())
+    written = tmp_path / "info.json"
+    assert run(command, folder, "--localizability", "--json", written) == 0
+    document = json.loads(written.read_text())
     assert document["localizability"]["places_lost_in_some_heading"] == 1.0
     assert "localizability" in capsys.readouterr().out
-    command.run(parser.parse_args([str(folder)]))
+    run(command, folder)
     assert "localizability" not in capsys.readouterr().out

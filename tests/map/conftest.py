@@ -4,5 +4,4 @@ import sys
 from pathlib import Path
 
 sys.path.append(str(Path(__file__).parents[1] / "mapping"))
-from built_scene import built, scene_settings, use_scene  # noqa: F401
-from refining import _world, world  # noqa: F401
+from built_scene import built, scene_settings, target  # noqa: F401

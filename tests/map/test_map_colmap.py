@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hand_made import model_of
 
 from ground_station.errors import MapError
 from ground_station.geometry.camera import THESIS_CAMERA, Camera
@@ -36,18 +37,10 @@ def seen(camera: Camera, noise_px: float) -> tuple[Model, np.ndarray]:
     use = camera.uses(picture)
     image, point = np.divmod(np.arange(2 * len(points)), len(points))
     used, point = np.unique(point[use], return_inverse=True)
-    model = Model(
-        names=["a.png", "b.png"],
-        image_id=np.array([1, 2]),
-        wTc=wTc,
-        point_id=used + 1,
-        position=points[used],
-        image=image[use],
-        feature=np.zeros(len(point), np.int64),
-        point=point.ravel(),
+    model = model_of(
+        camera, wTc, points[used], image=image[use], point=point.ravel(),
         pixel_px=camera.undistort_to_pinhole(picture[use]),
-        camera=camera,
-    )
+    )  # fmt: skip
     return model, picture[use]
 
 

@@ -72,9 +72,9 @@ def test_what_contradicts_itself_is_refused(
     data = bytearray((copy / name).read_bytes())
     struct.pack_into(form, data, at, value)
     (copy / name).write_bytes(bytes(data))
-    with pytest.raises(MapError, match=words) as error:
+    with pytest.raises(MapError, match=words) as caught:
         colmap.read(copy)
-    assert "\n" not in str(error.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_count_that_takes_for_ever_is_refused_when_its_time_is_over(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hand_made import in_picture
 
 from ground_station.arrays import F64, I64, U8
 from ground_station.features import extractors
@@ -86,14 +88,7 @@ def make_scene(images: int = 16, points: int = 700, seed: int = 3) -> Scene:
     for T in wTc:
         local = poses.transform(poses.inverse(T), xyz)
         pixel = camera.project(local)
-        radius = np.linalg.norm(local[:, :2] / np.maximum(local[:, 2:], 1e-9), axis=1)
-        inside = (
-            (local[:, 2] > 0.5)
-            & (radius < 0.8)  # beyond, the thesis's lens folds back into the image
-            & (pixel > 0).all(axis=1)
-            & (pixel < [camera.width_px - 1, camera.height_px - 1]).all(axis=1)
-        )
-        index = np.flatnonzero(inside)
+        index = np.flatnonzero(in_picture(camera, local, pixel, 0.8))
         vectors = descriptor[index] + 0.05 * np.abs(rng.normal(size=(len(index), DIMENSION)))
         vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
         noisy = pixel[index] + NOISE_PX * rng.normal(size=(len(index), 2))
@@ -142,3 +137,9 @@ def built(tmp_path_factory: pytest.TempPathFactory, scene_settings: MappingSetti
         patch.setitem(extractors.METHODS, "scene", lambda _: SceneExtractor(scene))
         map_ = build.build_map(scene.frames(), scene.camera, scene_settings, folder)
     return Built(scene, scene_settings, map_, folder)
+
+
+@pytest.fixture
+def target(built: Built, tmp_path: Path) -> Path:
+    """A copy of the built map."""
+    return Path(shutil.copytree(built.folder, tmp_path / "map"))

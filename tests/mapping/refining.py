@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import pytest
 from built_scene import look_at
+from hand_made import by_frame, keyframes_of, observed
 
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
 from ground_station.map import colmap, landmarks, store
-from ground_station.map.model import Model
 from ground_station.map.observations import FlightObservations, landmarks_sha256
 from ground_station.mapping.refinement import shutter
 from ground_station.mapping.settings import MappingSettings
@@ -76,7 +76,7 @@ class World:
         rng, camera = np.random.default_rng(seed), self.map.info.camera
         t_s = np.arange(frames) / rate_hz
         wTc = _along(t_s)
-        rows = [_seen(self.points, T, camera, rng, noise_px) for T in wTc]
+        seen = by_frame([_seen(self.points, T, camera, rng, noise_px) for T in wTc])
         return FlightObservations(
             name=name,
             map="room",
@@ -84,9 +84,7 @@ class World:
             camera=camera,
             time_ns=np.round(t_s * 1e9).astype(np.int64),
             wTc=wTc,
-            offset=np.cumsum([0, *(len(index) for index, _ in rows)]),
-            landmark=self.map.landmarks.id[np.concatenate([index for index, _ in rows])],
-            pixel_px=np.concatenate([pixel for _, pixel in rows]).astype(np.float32),
+            **seen | {"landmark": self.map.landmarks.id[seen["landmark"]]},
         )
 
     def errors_m(self, map_: store.Map) -> np.ndarray:
@@ -135,24 +133,8 @@ def _world(tmp_path_factory) -> World:
         ]
     )
     rows = [_seen(points, T, camera, rng) for T in wTc]
-    seen = np.bincount(np.concatenate([index for index, _ in rows]), minlength=count) >= 6
-    points, new = points[seen], np.cumsum(seen) - 1
-    rows = [(new[index[seen[index]]], pixel[seen[index]]) for index, pixel in rows]
-    index = np.concatenate([index for index, _ in rows])
-    pixel = np.concatenate([pixel for _, pixel in rows])
-    image = np.repeat(np.arange(len(rows)), [len(i) for i, _ in rows])
-    model = Model(
-        names=[f"frame-{k:06d}" for k in range(8)],
-        image_id=np.arange(8) + 1,
-        wTc=wTc,
-        point_id=np.arange(len(points)) * 3 + 5,
-        position=points,
-        image=image,
-        feature=np.zeros(len(image), np.int64),
-        point=index,
-        pixel_px=camera.undistort_to_pinhole(pixel),
-        camera=camera,
-    )
+    model, used = observed(camera, wTc, points, rows, least=6)
+    points, pixel = model.position, np.concatenate([pixel for _, pixel in rows])[used]
     reconstruction = colmap.from_arrays(model, camera)
     adjustment.adjust(reconstruction, loss_px=1.0, threads=1)
     found, position = colmap.positions(reconstruction, model)
@@ -164,16 +146,13 @@ def _world(tmp_path_factory) -> World:
     info.built, info.registration = {"images": 8}, {"method": "observations", "points": 12}
     map_ = store.Map(
         info,
-        landmarks.make_landmarks(model, np.ones((len(image), 32), np.float32)),
-        store.Keyframes(
-            model.names,
-            np.arange(8) * 400_000_000,
-            model.wTc,
-            np.searchsorted(image, np.arange(9)),
-            index.astype(np.int32),
-            pixel.astype(np.float32),
+        landmarks.make_landmarks(model, np.ones((len(model.image), 32), np.float32)),
+        keyframes_of(
+            model.wTc, 400_000_000,
+            offset=np.searchsorted(model.image, np.arange(9)),
+            landmark=model.point.astype(np.int32), pixel_px=pixel.astype(np.float32),
         ),
-    )
+    )  # fmt: skip
     map_.landmarks.descriptor = descriptor
     path = tmp_path_factory.mktemp("world") / "room"
     path.mkdir()

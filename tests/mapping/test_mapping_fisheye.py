@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from hand_made import camera_file
 
 from ground_station import cli
 from ground_station.geometry import poses
@@ -86,8 +86,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
             cv2.imwrite(str(folder / name / f"{k:03d}.png"), picture(FISHEYE, wTc, walls, rng))
         times_ns = np.round(np.arange(len(path)) / 2 * 1e9).astype(np.int64)
         write_tum(folder / f"{name}.txt", Trajectory.from_poses(times_ns, path))
-    lines = [f"{k} = {json.dumps(v)}" for k, v in FISHEYE.as_dict().items()]
-    (folder / "camera.toml").write_text("\n".join(lines) + "\n")
+    camera_file(folder / "camera.toml", FISHEYE)
     blimp("map", "build", folder / "map", "--camera", folder / "camera.toml", "--rate-hz", 2,
           "--features", "rootsift", "--out", folder / "room")  # fmt: skip
     blimp("map", "register", folder / "room", "--trajectory", folder / "map.txt")

@@ -14,13 +14,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hand_made import in_picture, keyframes_of, observed
 
 from ground_station.features import extractors
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.map import colmap, landmarks, store
-from ground_station.map.model import Model
 from ground_station.map_update.extension.extend import Extension, extend_map
 from ground_station.mapping.settings import ExtendSettings, MappingSettings
 
@@ -71,9 +71,7 @@ class Corridor:
         """Points, distorted pixels and descriptors of one picture."""
         local = poses.transform(poses.inverse(wTc), self.points)
         pixel = CAMERA.project(local) + noise_px * rng.normal(size=(len(local), 2))
-        inside = (local[:, 2] > 0.5) & (pixel > 0).all(axis=1)
-        inside &= (pixel < [CAMERA.width_px - 1, CAMERA.height_px - 1]).all(axis=1)
-        inside &= np.linalg.norm(local[:, :2], axis=1) < 0.75 * local[:, 2]
+        inside = in_picture(CAMERA, local, pixel, 0.75)
         if light == "noon":
             inside &= ~self.late
         index = np.flatnonzero(inside)
@@ -115,37 +113,19 @@ def write_map(corridor: Corridor, folder: Path, seed=1) -> store.Map:
     rng = np.random.default_rng(seed)
     wTc = np.array([corridor.pose(x, seed) for x in np.arange(0.5, MAPPED_M, 0.3)])
     rows = [corridor.seen(T, "noon", rng) for T in wTc]
-    times = np.bincount(np.concatenate([r[0] for r in rows]), minlength=len(corridor.points))
-    kept, new = np.flatnonzero(times >= 3), np.cumsum(times >= 3) - 1
-    rows = [tuple(part[times[r[0]] >= 3] for part in r) for r in rows]
-    image = np.repeat(np.arange(len(rows)), [len(r[0]) for r in rows])
-    index, pixel, look = (np.concatenate([r[i] for r in rows]) for i in range(3))
-    model = Model(
-        names=[f"frame-{k:06d}" for k in range(len(rows))],
-        image_id=np.arange(len(rows)) + 1,
-        wTc=wTc,
-        point_id=kept + 7,
-        position=corridor.points[kept],
-        image=image,
-        feature=np.zeros(len(image), np.int64),
-        point=new[index],
-        pixel_px=CAMERA.undistort_to_pinhole(pixel),
-        camera=CAMERA,
-    )
+    model, used = observed(CAMERA, wTc, corridor.points, rows, least=3)
+    pixel, look = (np.concatenate([row[i] for row in rows])[used] for i in (1, 2))
     info = store.MapInfo("corridor", "c" * 64, DIMENSION, CAMERA, folder.name, "world", "m")
     info.registration = {"method": "observations", "points": 12}
     map_ = store.Map(
         info,
         landmarks.make_landmarks(model, look),
-        store.Keyframes(
-            model.names,
-            np.arange(len(rows)) * 10**9,
-            wTc,
-            np.searchsorted(image, np.arange(len(rows) + 1)),
-            new[index].astype(np.int32),
-            pixel,
+        keyframes_of(
+            wTc, 10**9,
+            offset=np.searchsorted(model.image, np.arange(len(rows) + 1)),
+            landmark=model.point.astype(np.int32), pixel_px=pixel,
         ),
-    )
+    )  # fmt: skip
     folder.mkdir()
     colmap.write(colmap.from_arrays(model, CAMERA), folder / "sparse")
     store.save_tables(folder, map_)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from corridor_light import CAMERA
+from hand_made import NO_KEYFRAMES, model_of
 
 from ground_station.geometry import poses
 from ground_station.map import landmarks, store
-from ground_station.map.model import Model
 from ground_station.map_update.extension.extend import never_seen
 from ground_station.map_update.extension.tracks import joined, triangulate
 from ground_station.mapping.sfm.adjustment import adjust_among_fixed
@@ -50,18 +52,7 @@ def _seen(points, wTc, noise_px=0.0, seed=0):
     local = np.array([poses.transform(poses.inverse(wTc[k]), points[m][None])[0] for k, m in pairs])
     pixel = local[:, :2] / local[:, 2:] * pinhole[:2] + pinhole[2:]
     pixel += noise_px * np.random.default_rng(seed).normal(size=pixel.shape)
-    return Model(
-        names=[str(k) for k in range(len(wTc))],
-        image_id=np.arange(len(wTc)) + 1,
-        wTc=np.array(wTc),
-        point_id=np.arange(len(points)) + 1,
-        position=np.array(points),
-        image=image,
-        feature=point,
-        point=point,
-        pixel_px=pixel,
-        camera=CAMERA,
-    )
+    return model_of(CAMERA, wTc, points, image=image, feature=point, point=point, pixel_px=pixel)
 
 
 def _aside(*steps_m):
@@ -73,7 +64,7 @@ def test_points_are_where_their_rays_meet_and_those_without_an_angle_are_not_kno
     model = _seen(points, _aside(0.0, 0.3, 0.6, 0.9))
     spoiled = model.pixel_px.copy()
     spoiled[(model.image == 3) & (model.point == 3)] += [300.0, 40.0]
-    model = Model(**{**vars(model), "pixel_px": spoiled, "position": np.full((4, 3), np.nan)})
+    model = replace(model, pixel_px=spoiled, position=np.full((4, 3), np.nan))
     found, good = triangulate(model, 4.0, 1.5)
     assert good.tolist() == [True, True, False, False]
     assert np.allclose(found.position[:2], points[:2], atol=1e-6)
@@ -84,7 +75,7 @@ def test_a_observation_that_is_off_a_little_is_left_out_of_its_point():
     model = _seen(points, _aside(0.0, 0.2, 0.4, 0.6, 0.8, 1.0))
     off = model.pixel_px.copy()
     off[2] += [0.0, 12.0]
-    found, good = triangulate(Model(**{**vars(model), "pixel_px": off}), 4.0, 1.5)
+    found, good = triangulate(replace(model, pixel_px=off), 4.0, 1.5)
     assert good.all() and np.allclose(found.position, points, atol=1e-6)
 
 
@@ -96,7 +87,7 @@ def test_what_is_fixed_does_not_move_by_a_bit_and_the_rest_finds_its_place():
     position, wTc = points.copy(), true.wTc.copy()
     position[~fixed] += rng.normal(0, 0.03, (20, 3))
     wTc[1:] = [T @ poses.exp(rng.normal(0, 0.01, 6)) for T in wTc[1:]]
-    model = Model(**{**vars(true), "position": position, "wTc": wTc})
+    model = replace(true, position=position, wTc=wTc)
     images = np.array([True, False, False])
     moved, found = adjust_among_fixed(model, fixed, images, CAMERA, loss_px=1.0, threads=1)
     assert np.array_equal(found[fixed], points[fixed]) and np.array_equal(moved[0], wTc[0])
@@ -138,11 +129,7 @@ def test_cones_and_distances_hold_the_old_observations_and_the_new(seen_from_the
 def test_what_is_often_in_view_and_never_seen_is_counted(seen_from_the_front):
     lm = seen_from_the_front
     info = store.MapInfo("corridor", "c" * 64, 4, CAMERA)
-    none = store.Keyframes(
-        [], np.empty(0, np.int64), np.empty((0, 4, 4)), np.zeros(1, np.int64),
-        np.empty(0, np.int32), np.empty((0, 2), np.float32),
-    )  # fmt: skip
-    map_ = store.Map(info, lm, none)
+    map_ = store.Map(info, lm, NO_KEYFRAMES)
     seen = np.arange(0, 30, 2)
     cameras = np.array(_aside(*np.linspace(-0.1, 0.1, 10)))
     assert never_seen(map_, cameras, seen, 10) == {"expected": 30, "never_seen": 15}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import os
@@ -16,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from corridor_light import RATE_HZ, SETTINGS
+from hand_made import NO_KEYFRAMES, run
 
 from ground_station.commands import maps
 from ground_station.errors import InputError, MapError
@@ -32,6 +32,12 @@ ROOT = HERE.parents[2]
 
 def _extend(world, out, *inputs, **more):
     return extend_map(world.folder, inputs, SETTINGS, out=out, rate_hz=RATE_HZ, **more)
+
+
+@pytest.fixture
+def folder(corridor_world, tmp_path) -> Path:
+    """A copy of the corridor's map."""
+    return shutil.copytree(corridor_world.folder, tmp_path / "map")
 
 
 def _content(folder: Path) -> dict[str, bytes]:
@@ -75,11 +81,7 @@ def test_another_camera_is_refused_by_its_size_before_a_frame_is_read(corridor_w
         _extend(corridor_world, tmp_path / "out", corridor_world.flights["sunset"], camera=other)
 
 
-def test_a_map_of_features_that_are_not_here_is_refused_by_name(
-    corridor_world, short_flight, tmp_path
-):
-    folder = tmp_path / "map"
-    shutil.copytree(corridor_world.folder, folder)
+def test_a_map_of_features_that_are_not_here_is_refused_by_name(folder, short_flight):
     toml = folder / "map.toml"
     text = toml.read_text()
     toml.write_text(text.replace('name = "corridor"\nsha256', 'name = "superglue"\nsha256'))
@@ -90,34 +92,19 @@ def test_a_map_of_features_that_are_not_here_is_refused_by_name(
         extend_map(folder, [short_flight], SETTINGS, rate_hz=RATE_HZ)
 
 
-def test_a_map_without_keyframes_is_refused(corridor_world, short_flight, tmp_path):
-    folder = tmp_path / "map"
-    shutil.copytree(corridor_world.folder, folder)
-    map_ = store.load(folder)
-    none = store.Keyframes(
-        [], np.empty(0, np.int64), np.empty((0, 4, 4)), np.zeros(1, np.int64),
-        np.empty(0, np.int32), np.empty((0, 2), np.float32),
-    )  # fmt: skip
-    store.save_tables(folder, dataclasses.replace(map_, keyframes=none))
+def test_a_map_without_keyframes_is_refused(folder, short_flight):
+    store.save_tables(folder, dataclasses.replace(store.load(folder), keyframes=NO_KEYFRAMES))
     with pytest.raises(MapError, match="holds no keyframes"):
         extend_map(folder, [short_flight], SETTINGS, rate_hz=RATE_HZ)
 
 
 def test_the_command_prints_before_and_after_and_refuses_the_same_flight(
-    corridor_world, short_flight, tmp_path, capsys
+    folder, short_flight, tmp_path, capsys
 ):
-    folder = tmp_path / "map"
-    shutil.copytree(corridor_world.folder, folder)
     before = _content(folder)
     settings = tmp_path / "settings.toml"
     settings.write_text("threads = 1\n[extend]\nmin_track = 3\n")
-
-    def run(*words):
-        parser = argparse.ArgumentParser()
-        maps.add_arguments(parser)
-        return maps.run(parser.parse_args([str(word) for word in words]))
-
-    words = ["extend", folder, short_flight, "--rate-hz", RATE_HZ, "--settings", settings]
+    words = [maps, "extend", folder, short_flight, "--rate-hz", RATE_HZ, "--settings", settings]
     assert run(*words, "--json", tmp_path / "extend.json") == 0
     printed, report = capsys.readouterr().out, json.loads((tmp_path / "extend.json").read_text())
     for name in ("keyframes", "landmarks", "modes", "bytes"):
@@ -138,10 +125,8 @@ def test_the_command_prints_before_and_after_and_refuses_the_same_flight(
 
 @pytest.mark.parametrize("moment", ["describe", "save_info"])
 def test_stopped_at_any_moment_it_leaves_the_old_map(
-    corridor_world, short_flight, tmp_path, monkeypatch, moment
+    folder, short_flight, tmp_path, monkeypatch, moment
 ):
-    folder = tmp_path / "map"
-    shutil.copytree(corridor_world.folder, folder)
     map_ = store.load(folder)
     map_.info.built["noise_px"] = 0.3
     store.save_tables(folder, map_)
@@ -162,9 +147,9 @@ def test_stopped_at_any_moment_it_leaves_the_old_map(
     assert losses == ([0.3] if moment == "describe" else [])
 
 
-def test_killed_while_it_writes_it_leaves_the_old_map(corridor_world, short_flight, tmp_path):
-    folder = tmp_path / "map"
-    shutil.copytree(corridor_world.folder, folder)
+def test_killed_while_it_writes_it_leaves_the_old_map(
+    corridor_world, folder, short_flight, tmp_path
+):
     before = _content(folder)
     pictures = corridor_world.corridor.pictures[:9]
     arrays = {
@@ -191,7 +176,7 @@ def test_killed_while_it_writes_it_leaves_the_old_map(corridor_world, short_flig
         "extend.store.save_tables = killed\n"
         "extend.extend_map(sys.argv[1], [sys.argv[2]], SETTINGS, rate_hz=RATE_HZ)\n"
     )
-    path = os.pathsep.join([str(HERE), str(ROOT)])
+    path = os.pathsep.join(map(str, (HERE, ROOT / "tests/mapping", ROOT)))
     words = [str(folder), str(short_flight), str(tmp_path / "pictures.npz")]
     done = subprocess.run(
         [sys.executable, "-c", script, *words],

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from built_scene import look_at
+from hand_made import in_picture, observed
 
 from ground_station.arrays import F64
 from ground_station.geometry import poses
@@ -20,54 +21,29 @@ from ground_station.mapping.sfm import adjustment
 SIZE_M = np.array([12.0, 9.0, 3.0])
 
 
-def walked(camera: Camera, images: int = 60, count: int = 900) -> tuple[Model, F64]:
-    """What a camera sees that is carried round a room and looks at its walls, and the true points.
-
-    The model is true, its pixels are the camera's.
-    """
+def walked(camera: Camera, images: int = 60, count: int = 900) -> Model:
+    """The true model of what a camera sees that is carried round a room and looks at its walls."""
     rng = np.random.default_rng(2)
     points = rng.uniform(0, 1, (count, 3)) * SIZE_M
     wall = rng.integers(0, 2, count)
     points[np.arange(count), wall] = np.where(rng.random(count) < 0.5, 0.0, SIZE_M[wall])
-    seen, pixel, wTc = [], [], []
+    rows, wTc = [], []
     for angle in np.linspace(0, 2 * np.pi, images, endpoint=False):
         out = np.array([np.cos(angle), np.sin(angle), 0.0])
         wTc.append(look_at(SIZE_M / 2 + 0.2 * out * SIZE_M, SIZE_M / 2 + 2 * out * SIZE_M))
         local = poses.transform(poses.inverse(wTc[-1]), points)
-        with np.errstate(invalid="ignore"):
-            pixels = camera.project(local)
-            inside = (local[:, 2] > 0.5) & (np.linalg.norm(local[:, :2], axis=1) < local[:, 2])
-            inside &= ((pixels > 0) & (pixels < [639, 479])).all(axis=1)
-        seen.append(np.flatnonzero(inside))
-        pixel.append(pixels[inside])
-    point, image = np.concatenate(seen), np.repeat(np.arange(images), [len(s) for s in seen])
-    often = np.bincount(point, minlength=count) >= 3
-    point, image, pixels = (
-        point[often[point]],
-        image[often[point]],
-        np.concatenate(pixel)[often[point]],
-    )
-    points, known = points[often], np.flatnonzero(often)
-    model = Model(
-        names=[f"frame-{k:06d}" for k in range(images)],
-        image_id=np.arange(images) + 1,
-        wTc=np.array(wTc),
-        point_id=np.arange(len(points)) * 3 + 5,
-        position=points,
-        image=image,
-        feature=np.zeros(len(image), np.int64),
-        point=np.searchsorted(known, point),
-        pixel_px=np.empty((0, 2)),
-        camera=camera,
-    )
-    return replace(model, pixel_px=camera.undistort_to_pinhole(pixels)), points
+        pixels = camera.project(local)
+        inside = in_picture(camera, local, pixels, 1.0)
+        rows.append((np.flatnonzero(inside), pixels[inside]))
+    return observed(camera, np.array(wTc), points, rows, least=3)[0]
 
 
 @pytest.mark.parametrize("share", [0.003, -0.003])
 def test_it_tells_where_the_points_are_with_another_lens(share: float) -> None:
     true = replace(THESIS_CAMERA, readout_s=0.0)
     wrong = replace(true, fx_px=true.fx_px / (1 + share), fy_px=true.fy_px / (1 + share))
-    model, points = walked(true)
+    model = walked(true)
+    points = model.position
     pixels = true.distort((model.pixel_px - model.pinhole[2:]) / model.pinhole[:2])
     believed = replace(model, camera=wrong, pixel_px=wrong.undistort_to_pinhole(pixels))
     bent = colmap.from_arrays(believed, wrong)

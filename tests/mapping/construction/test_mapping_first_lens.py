@@ -8,10 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hand_made import camera_file
 from PIL import Image
 
 from ground_station.errors import CameraError
-from ground_station.geometry.camera import THESIS_CAMERA, Camera
+from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.geometry.resizing import scaled, turned
 from ground_station.mapping.construction.first_lens import GUESS, KNOWN, SIGMA_GUESS
 from ground_station.mapping.construction.inputs import open_inputs
@@ -33,12 +34,6 @@ def pictures(
         image = Image.fromarray(np.full((size[1], size[0]), 50 * k, np.uint8))
         image.save(folder / f"{k}.jpg", exif=exif)
     return str(folder)
-
-
-def file_of(path: Path, camera: Camera) -> str:
-    lines = (f"{key} = {value!r}\n" for key, value in camera.as_dict().items())
-    path.write_text("".join(lines).replace("'", '"'))
-    return str(path)
 
 
 def test_without_any_word_of_the_lens_it_is_guessed_and_said_to_be(tmp_path: Path) -> None:
@@ -79,7 +74,7 @@ def test_inputs_of_two_lenses_or_sizes_are_refused_by_name(tmp_path: Path) -> No
 
 
 def test_a_file_goes_before_metadata_and_may_be_a_little_off(tmp_path: Path) -> None:
-    camera = file_of(tmp_path / "camera.toml", THESIS_CAMERA)
+    camera = camera_file(tmp_path / "camera.toml", THESIS_CAMERA)
     inputs = open_inputs([pictures(tmp_path / "a", film_mm=26)], SETTINGS, camera=camera)
     assert inputs.camera == THESIS_CAMERA and inputs.said == []
     assert inputs.prior.source == "file" and inputs.prior.calibrated
@@ -87,7 +82,7 @@ def test_a_file_goes_before_metadata_and_may_be_a_little_off(tmp_path: Path) -> 
 
 
 def test_a_file_of_another_size_is_scaled_to_the_pictures_and_it_is_said(tmp_path: Path) -> None:
-    camera = file_of(tmp_path / "camera.toml", scaled(THESIS_CAMERA, 1280, 960))
+    camera = camera_file(tmp_path / "camera.toml", scaled(THESIS_CAMERA, 1280, 960))
     inputs = open_inputs([pictures(tmp_path / "a")], SETTINGS, camera=camera)
     for name, value in THESIS_CAMERA.as_dict().items():
         assert getattr(inputs.camera, name) == pytest.approx(value), name
@@ -95,7 +90,7 @@ def test_a_file_of_another_size_is_scaled_to_the_pictures_and_it_is_said(tmp_pat
 
 
 def test_a_file_of_pictures_as_shown_is_turned_to_the_stored_ones(tmp_path: Path) -> None:
-    camera = file_of(tmp_path / "camera.toml", turned(THESIS_CAMERA, 1))
+    camera = camera_file(tmp_path / "camera.toml", turned(THESIS_CAMERA, 1))
     a = pictures(tmp_path / "a", orientation=6)
     inputs = open_inputs([a], SETTINGS, camera=camera)
     assert inputs.camera == THESIS_CAMERA and "turned to the stored ones" in inputs.said[0]
@@ -108,7 +103,7 @@ def test_a_file_of_pictures_as_shown_is_turned_to_the_stored_ones(tmp_path: Path
 
 
 def test_a_file_of_another_shape_is_refused_with_what_to_do(tmp_path: Path) -> None:
-    camera = file_of(tmp_path / "camera.toml", THESIS_CAMERA)
+    camera = camera_file(tmp_path / "camera.toml", THESIS_CAMERA)
     with pytest.raises(CameraError, match=r"a: .*960x540.*640x480.*calibrate at 960x540"):
         open_inputs([pictures(tmp_path / "a", (960, 540))], SETTINGS, camera=camera)
 

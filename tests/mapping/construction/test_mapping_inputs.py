@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import hand_made
 import numpy as np
 import pytest
 from panning import CAMERA, Place
@@ -60,11 +61,7 @@ def record(path: Path, units: list[bytes], fx_px: float = CAMERA.fx_px) -> Path:
 
 @pytest.fixture
 def camera_file(tmp_path: Path) -> str:
-    path = tmp_path / "camera.toml"
-    path.write_text(
-        "".join(f"{k} = {v!r}\n" for k, v in CAMERA.as_dict().items()).replace("'", '"')
-    )
-    return str(path)
+    return hand_made.camera_file(tmp_path / "camera.toml", CAMERA)
 
 
 def names(inputs: Inputs) -> list[str]:

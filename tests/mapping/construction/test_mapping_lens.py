@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hand_made import in_picture, observed
 from scipy.spatial.transform import Rotation
 
 from ground_station.errors import MapError
@@ -57,7 +58,7 @@ def _views(camera: Camera, wTc, xyz, seed: int) -> tuple[Images, Model]:
     step = [poses.log(each) for each in poses.inverse(wTc[:-1]) @ wTc[1:]]
     step = np.array([*step, step[-1]]) / STEP_S
     rng = np.random.default_rng(seed)
-    image, feature, point, features = [], [], [], []
+    rows, features = [], []
     for k, T in enumerate(wTc):
         local = poses.transform(poses.inverse(T), xyz)
         pixel = camera.project(local)
@@ -67,36 +68,18 @@ def _views(camera: Camera, wTc, xyz, seed: int) -> tuple[Images, Model]:
             pixel = camera.project(
                 np.einsum("nij,nj->ni", there[:, :3, :3], local) + there[:, :3, 3]
             )
-        with np.errstate(invalid="ignore"):
-            radius = np.linalg.norm(local[:, :2], axis=1) / local[:, 2]
-            inside = (local[:, 2] > 0.5) & (radius < 0.8) & (pixel > 0).all(axis=1)
-            inside &= (pixel < [camera.width_px - 1, camera.height_px - 1]).all(axis=1)
-        seen = np.flatnonzero(inside)
+        seen = np.flatnonzero(in_picture(camera, local, pixel, 0.8))
         noisy = pixel[seen] + NOISE_PX * rng.normal(size=(len(seen), 2))
         count = len(seen)
         features.append(
             Features(noisy.astype("f4"), np.ones(count, "f4"), np.zeros((count, 4), "f4"))
         )
-        image.append(np.full(count, k))
-        feature.append(np.arange(count))
-        point.append(seen)
-    often = np.bincount(np.concatenate(point), minlength=len(xyz)) > 2
-    new, keep = np.cumsum(often) - 1, often[np.concatenate(point)]
-    model = Model(
-        names=[f"frame-{k:06d}" for k in range(len(wTc))],
-        image_id=np.arange(len(wTc)) + 1,
-        wTc=wTc,
-        point_id=np.flatnonzero(often) + 1,
-        position=xyz[often],
-        image=np.concatenate(image)[keep],
-        feature=np.concatenate(feature)[keep],
-        point=new[np.concatenate(point)[keep]],
-        pixel_px=np.zeros((int(keep.sum()), 2)),
-        camera=camera,
-    )
-    names = model.names
-    time_ns = (np.arange(len(names)) * 1e9 * STEP_S).astype(np.int64)
-    return Images(names, time_ns, features, [f.keypoints_px.astype(float) for f in features]), model
+        rows.append((seen, noisy))
+    model, used = observed(camera, wTc, xyz, rows, least=3)
+    feature = np.concatenate([np.arange(len(seen)) for seen, _ in rows])[used]
+    time_ns = (np.arange(len(wTc)) * 1e9 * STEP_S).astype(np.int64)
+    pixels = [f.keypoints_px.astype(float) for f in features]
+    return Images(model.names, time_ns, features, pixels), replace(model, feature=feature)
 
 
 def _adjusted_with(camera: Camera, images: Images, model: Model) -> Model:

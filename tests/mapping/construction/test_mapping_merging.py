@@ -7,11 +7,11 @@ from dataclasses import replace
 import corridor_geometry as geometry
 import numpy as np
 import pytest
+from hand_made import model_of
 from scipy.spatial.transform import Rotation
 
 from ground_station.geometry.alignment import Alignment
 from ground_station.map import colmap, landmarks
-from ground_station.map.model import Model
 from ground_station.mapping.construction import structure
 from ground_station.mapping.construction.placing import loops, merging
 from ground_station.mapping.construction.placing.placed import Placed
@@ -183,13 +183,12 @@ def test_models_without_a_pair_between_them_are_reported_by_name(corridor, tmp_p
 
 def test_ranges_of_names_are_few(corridor, tmp_path):
     names = [f"{k}.png" for k in range(12)]
-    model = colmap.from_arrays(
-        Model(
-            names[::2], np.arange(1, 13, 2), np.tile(np.eye(4), (6, 1, 1)), np.empty(0, np.int64),
-            np.empty((0, 3)), *[np.empty(0, np.int64)] * 3, np.empty((0, 2)), PINHOLE,
-        ),
-        corridor.camera,
+    none = np.empty(0, np.int64)
+    model = model_of(
+        corridor.camera, np.tile(np.eye(4), (6, 1, 1)), np.empty((0, 3)), names=names[::2],
+        image_id=np.arange(1, 13, 2), image=none, point=none, pixel_px=np.empty((0, 2)),
     )  # fmt: skip
+    model = colmap.from_arrays(model, corridor.camera)
     assert merging.describe(model, names, "why").startswith(
         "0.png, 2.png, 4.png, 6.png, 2 more: 6 images form a model of their own: why"
     )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hand_made import run
 
 from ground_station.commands import maps
 from ground_station.geometry.alignment import align
@@ -25,17 +25,11 @@ DATA = Path(__file__).parents[3] / "../shared/data/redkitchen"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data/redkitchen is not there")
 
 
-def _run(*words: object) -> int:
-    parser = argparse.ArgumentParser()
-    maps.add_arguments(parser)
-    return maps.run(parser.parse_args([str(word) for word in words]))
-
-
 @needs_data
 def test_twelve_frames_of_a_kitchen_are_one_map_within_two_centimetres(tmp_path):
     folder = tmp_path / "kitchen"
     arguments = ("build", DATA / "frames", "--camera", DATA / "camera.toml", "--range", "0:144:12")
-    assert _run(*arguments, "--out", folder) == 0
+    assert run(maps, *arguments, "--out", folder) == 0
     map_ = store.load(folder)
     assert map_.keyframes.names[:2] == ["frame-000000.jpg", "frame-000012.jpg"]
     assert len(map_.keyframes) == 12
@@ -47,7 +41,7 @@ def test_twelve_frames_of_a_kitchen_are_one_map_within_two_centimetres(tmp_path)
     assert np.linalg.norm(fit.apply(centres) - positions, axis=1).max() < 0.02
     report = tmp_path / "register.json"
     trajectory = DATA / "pseudo_groundtruth.txt"
-    assert _run("register", folder, "--trajectory", trajectory, "--json", report) == 0
+    assert run(maps, "register", folder, "--trajectory", trajectory, "--json", report) == 0
     assert json.loads(report.read_text())["residual_rms_m"] < 0.01
     assert store.load_info(folder).registered
 
@@ -57,8 +51,8 @@ def test_thirteen_frames_of_a_kitchen_place_nine_in_ten_of_another_pass(tmp_path
     """Of a thin map a picture shows few landmarks: a prediction says the rest."""
     folder, truth = tmp_path / "kitchen", DATA / "official_groundtruth.txt"
     arguments = ("build", DATA / "frames", "--camera", DATA / "camera.toml", "--range", "0:500:40")
-    assert _run(*arguments, "--out", folder) == 0
-    assert _run("register", folder, "--trajectory", truth) == 0
+    assert run(maps, *arguments, "--out", folder) == 0
+    assert run(maps, "register", folder, "--trajectory", truth) == 0
     map_, camera, settings = (
         store.load(folder),
         load_camera(DATA / "camera.toml"),
@@ -81,7 +75,7 @@ def test_thirteen_frames_of_a_kitchen_place_nine_in_ten_of_another_pass(tmp_path
 def test_a_right_lens_is_kept_where_the_camera_s_motion_looks_like_another(tmp_path):
     folder = tmp_path / "kitchen"
     arguments = ("build", DATA / "frames", "--camera", DATA / "camera.toml", "--range", "0:192:12")
-    assert _run(*arguments, "--out", folder) == 0
+    assert run(maps, *arguments, "--out", folder) == 0
     lens = store.load_info(folder).built["lens"]
     assert lens["state"] == "kept" and "rolling shutter" in lens["said"]
     assert store.load(folder).info.camera == load_camera(DATA / "camera.toml")

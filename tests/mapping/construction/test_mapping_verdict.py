@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from hand_made import keyframes_of
 
 from ground_station.geometry.camera import Camera
-from ground_station.map.store import Keyframes, Landmarks, Map, MapInfo
+from ground_station.map.store import Landmarks, Map, MapInfo
 from ground_station.mapping.construction.verdict import next_step, verdict
 
 EVERY = [f"{k:04d}.jpg" for k in range(40)]
@@ -16,7 +18,6 @@ EVERY = [f"{k:04d}.jpg" for k in range(40)]
 
 def map_of(names: list[str], **built: Any) -> Map:
     """A map of these images, with 50 landmarks and what a build has written."""
-    n = len(names)
     landmarks = Landmarks(
         id=np.arange(50), position_m=np.zeros((50, 3)),
         covariance_m2=np.zeros((50, 3, 3), np.float32),
@@ -24,10 +25,7 @@ def map_of(names: list[str], **built: Any) -> Map:
         view_direction=np.zeros((50, 3), np.float32), view_cos=np.zeros(50, np.float32),
         distance_m=np.zeros((50, 2), np.float32), observations=np.full(50, 4, np.int32),
     )  # fmt: skip
-    keyframes = Keyframes(
-        names, np.arange(n), np.tile(np.eye(4), (n, 1, 1)), np.zeros(n + 1, np.int64),
-        np.zeros(0, np.int32), np.zeros((0, 2), np.float32),
-    )  # fmt: skip
+    keyframes = replace(keyframes_of(np.tile(np.eye(4), (len(names), 1, 1)), 1), names=names)
     built = {"images": 40, "observations": 200, "reprojection_px": 0.4312} | built
     return Map(MapInfo("rootsift", "0" * 64, 8, Camera(), built=built), landmarks, keyframes)
 

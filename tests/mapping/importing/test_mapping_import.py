@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 
 import cv2
 import numpy as np
 import pytest
 from foreign_model import foreign_model, image_name, write, write_pictures
+from hand_made import run
 
 from ground_station.commands import maps
 from ground_station.errors import InputError, MapError
@@ -22,12 +22,6 @@ from ground_station.map import colmap, store
 from ground_station.mapping.importing.build import covisible_pairs, import_model
 from ground_station.mapping.importing.pictures import open_pictures, taken_by
 from ground_station.mapping.sfm import foreign
-
-
-def run(*words: object) -> int:
-    parser = argparse.ArgumentParser()
-    maps.add_arguments(parser)
-    return maps.run(parser.parse_args([str(word) for word in words]))
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +90,7 @@ def test_the_command_says_what_is_missing_and_keeps_the_rest(
         (folder / "db").mkdir(parents=True, exist_ok=True)
         (folder / "db" / path.name).symlink_to(path)
     out = tmp_path / "hall"
-    words = ("import", model_folder, "--images", folder, "--features", "scene", "--out", out)
+    words = (maps, "import", model_folder, "--images", folder, "--features", "scene", "--out", out)
     assert run(*words, "--json", tmp_path / "figures.json") == 0
     said = capsys.readouterr().out
     assert "14 of the model's 16 images are in the map" in said

@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from hand_made import NO_KEYFRAMES
 from refining import SETTINGS
 
 from ground_station.errors import MapError
@@ -60,10 +61,7 @@ def test_an_empty_flight_and_a_map_without_observations_are_refused(world):
     empty = load_observations(world.folder.with_name("empty"))
     with pytest.raises(MapError, match="no frame that could be added"):
         refine_map(world.folder, [empty], SETTINGS)
-    none = store.Keyframes(
-        [], empty.time_ns, empty.wTc, empty.offset, np.empty(0, np.int32), empty.pixel_px
-    )
-    store.save_tables(world.folder, dataclasses.replace(world.map, keyframes=none))
+    store.save_tables(world.folder, dataclasses.replace(world.map, keyframes=NO_KEYFRAMES))
     with pytest.raises(MapError, match="no keyframes' observations"):
         refine_map(world.folder, [], SETTINGS)
 

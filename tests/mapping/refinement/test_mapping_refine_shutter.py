@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from hand_made import by_frame, keyframes_of
 from refining import SETTINGS, _along, _seen, _to_and_fro
 
 from ground_station.geometry import poses
@@ -53,14 +54,7 @@ def test_a_maps_own_shutter_is_undone_once_and_not_where_there_was_none(world):
         _seen(world.points, T, camera, rng, 0.1, speed, t, _to_and_fro)
         for T, t in zip(wTc, t_s.tolist(), strict=True)
     ]
-    keyframes = store.Keyframes(
-        [f"k{k}" for k in range(len(t_s))],
-        np.round(t_s * 1e9).astype(np.int64),
-        wTc,
-        np.cumsum([0, *(len(index) for index, _ in rows)]),
-        np.concatenate([index for index, _ in rows]).astype(np.int32),
-        np.concatenate([pixel for _, pixel in rows]).astype(np.float32),
-    )
+    keyframes = keyframes_of(wTc, 40_000_000, **by_frame(rows))
     info = dataclasses.replace(world.map.info, camera=camera)
     store.save_tables(world.folder, dataclasses.replace(world.map, info=info, keyframes=keyframes))
     first, result = refine_map(world.folder, [], SETTINGS)
@@ -74,12 +68,7 @@ def test_a_maps_own_shutter_is_undone_once_and_not_where_there_was_none(world):
     # Observations that a global shutter took are not spoilt by a readout that the camera file
     # claims.
     rows = [_seen(world.points, T, camera, rng, 0.1) for T in wTc]
-    keyframes = dataclasses.replace(
-        keyframes,
-        offset=np.cumsum([0, *(len(index) for index, _ in rows)]),
-        landmark=np.concatenate([index for index, _ in rows]).astype(np.int32),
-        pixel_px=np.concatenate([pixel for _, pixel in rows]).astype(np.float32),
-    )
+    keyframes = keyframes_of(wTc, 40_000_000, **by_frame(rows))
     store.save_tables(world.folder, dataclasses.replace(world.map, info=info, keyframes=keyframes))
     _, result = refine_map(world.folder, [], SETTINGS)
     assert not result.report["rolling_shutter"]["undone"]

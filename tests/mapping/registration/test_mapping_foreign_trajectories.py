@@ -5,7 +5,6 @@ All are made of the sample map's own mapping flight and of the other flight in t
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import re
 import shutil
@@ -15,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import test_mapping_pose_similarity as made
+from hand_made import run
 from scipy.spatial.transform import Rotation
 
 from ground_station.errors import BlimpError
@@ -106,10 +106,6 @@ def xyzw_as_wxyz(f: Flights) -> Trajectory:
     return Trajectory(right.time_ns, right.position_m, right.quaternion_xyzw[:, [3, 0, 1, 2]])
 
 
-def other_flight(f: Flights) -> Trajectory:
-    return f.other
-
-
 def stretched_over_the_map(f: Flights) -> Trajectory:
     """The other flight, given the times of the mapping flight."""
     at = np.linspace(0, len(f.other) - 1, len(f.time_ns)).astype(int)
@@ -129,7 +125,7 @@ def even_line(f: Flights) -> np.ndarray:
 
 SHIFT_NS = 1_500_000_000
 FOREIGN: dict[str, tuple[Callable[[Flights], Trajectory], str]] = {
-    "another flight in the building": (other_flight, "another flight"),
+    "another flight in the building": (lambda f: f.other, "another flight"),
     "another flight at these times": (stretched_over_the_map, "another flight"),
     "another flight without orientations": (
         lambda f: f.dense(rotations(stretched_over_the_map(f).wTc, level(f))),
@@ -193,10 +189,8 @@ FOREIGN: dict[str, tuple[Callable[[Flights], Trajectory], str]] = {
 def refused(folder: Path, path: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """What `blimp map register` says to a file that it refuses; it prints nothing else."""
     before = {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.glob("*.*")}
-    parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
     with pytest.raises(BlimpError) as caught:
-        command.run(parser.parse_args([str(folder), "--trajectory", str(path)]))
+        run(command, folder, "--trajectory", path)
     printed = capsys.readouterr()
     assert printed.out == "" and printed.err == ""
     assert before == {

@@ -7,13 +7,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hand_made import keyframes_of
 from scipy.spatial.transform import Rotation
 
 from ground_station.errors import BlimpError, MapError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import Alignment, align
 from ground_station.geometry.trajectory import Trajectory, read_tum
-from ground_station.map import store
 from ground_station.mapping.registration import pose_similarity
 from ground_station.mapping.registration.from_trajectory import by_trajectory
 
@@ -45,20 +45,9 @@ def model_of(wTc: np.ndarray, fit: Alignment) -> SimpleNamespace:
     """The map whose registration is `fit`: the true poses in the model's coordinates."""
     R = fit.rotation.T
     position = (wTc[:, :3, 3] - fit.translation) @ fit.rotation / fit.scale
-    return with_poses(poses.pose(R @ wTc[:, :3, :3], position))
-
-
-def with_poses(wTc: np.ndarray) -> SimpleNamespace:
-    n = len(wTc)
-    keyframes = store.Keyframes(
-        names=[f"frame-{k:06d}" for k in range(n)],
-        time_ns=np.arange(n) * STEP_NS,
-        wTc=wTc,
-        offset=np.zeros(n + 1, np.int64),
-        landmark=np.zeros(0, np.int64),
-        pixel_px=np.zeros((0, 2), np.float32),
+    return SimpleNamespace(
+        keyframes=keyframes_of(poses.pose(R @ wTc[:, :3, :3], position), STEP_NS)
     )
-    return SimpleNamespace(keyframes=keyframes)
 
 
 def trajectory_of(wTc: np.ndarray, sigma_m=0.0, sigma_deg=0.0, seed=0, offset=None) -> Trajectory:
@@ -279,9 +268,11 @@ def test_numbers_that_are_not_finite_are_refused_in_one_line(part, value):
     map_, trajectory = model_of(wTc, truth), trajectory_of(wTc)
     array = map_.keyframes.wTc if part == "map" else getattr(trajectory, part)
     array[(5, 0) if part != "map" else (5, 0, 3)] = value
-    with pytest.raises(MapError, match=r"at 2\.5.* not finite|'frame-000005' is not finite") as e:
+    with pytest.raises(
+        MapError, match=r"at 2\.5.* not finite|'frame-000005' is not finite"
+    ) as caught:
         by_trajectory(map_, trajectory, 0)
-    assert "\n" not in str(e.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("rotation", [np.zeros((3, 3)), np.diag([1.0, 1.0, -1.0]), 2 * np.eye(3)])
@@ -348,7 +339,7 @@ def test_depth_camera_poses_of_a_kitchen_do_not_turn_a_map_of_the_colour_camera(
     """KinectFusion's orientations are the depth camera's, some degrees off the colour camera's."""
     colour, depth = (read_tum(DATA / f"{name}groundtruth.txt") for name in ("pseudo_", ""))
     half = colour.time_ns < 500 / 30 * 1e9
-    map_ = with_poses(colour.wTc[half])
+    map_ = SimpleNamespace(keyframes=keyframes_of(colour.wTc[half], STEP_NS))
     map_.keyframes.time_ns[:] = colour.time_ns[half]
     found = by_trajectory(map_, depth, 0)
     assert found.report["orientations"] == 0

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hand_made import model_of
 
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.geometry.trajectory import Trajectory
 from ground_station.map import colmap, landmarks, store
-from ground_station.map.model import Model
 from ground_station.mapping.registration import observations, register
 
 pycolmap = colmap.pycolmap
@@ -38,6 +38,12 @@ def world_points():
     return points
 
 
+@pytest.fixture
+def lines(built, world_points) -> list[str]:
+    """Of these places, all as they should be."""
+    return make_pairs(built.scene, world_points, np.random.default_rng(1))
+
+
 def _pairs(tmp_path: Path, lines: list[str]) -> observations.PointObservations:
     path = tmp_path / "PAIRS.csv"
     path.write_text("\n".join(lines) + "\n")
@@ -48,10 +54,7 @@ def _camera_errors(map_: store.Map, scene) -> np.ndarray:
     return np.linalg.norm(map_.keyframes.wTc[:, :3, 3] - scene.wTc[:, :3, 3], axis=1)
 
 
-def test_observations_of_known_points_put_the_map_into_the_world(
-    built, target, tmp_path, world_points
-):
-    lines = make_pairs(built.scene, world_points, np.random.default_rng(1))
+def test_observations_of_known_points_put_the_map_into_the_world(built, target, tmp_path, lines):
     moved, found = register.register_map(
         target, observations=_pairs(tmp_path, lines), source="P.csv"
     )
@@ -65,8 +68,7 @@ def test_observations_of_known_points_put_the_map_into_the_world(
     assert 0 < report["scale_sigma_percent"] < 2
 
 
-def test_everything_in_the_folder_is_in_world_coordinates(built, target, tmp_path, world_points):
-    lines = make_pairs(built.scene, world_points, np.random.default_rng(1))
+def test_everything_in_the_folder_is_in_world_coordinates(target, tmp_path, lines):
     register.register_map(target, observations=_pairs(tmp_path, lines), source="P.csv")
     loaded = store.load(target)
     model = pycolmap.Reconstruction(target / "sparse")
@@ -87,8 +89,7 @@ def test_everything_in_the_folder_is_in_world_coordinates(built, target, tmp_pat
     assert np.abs(landmarks.residuals_px(arrays)).max() < 4
 
 
-def test_registering_again_changes_nothing_but_the_report(built, target, tmp_path, world_points):
-    lines = make_pairs(built.scene, world_points, np.random.default_rng(1))
+def test_registering_again_changes_nothing_but_the_report(built, target, tmp_path, lines):
     first, _ = register.register_map(target, observations=_pairs(tmp_path, lines))
     second, found = register.register_map(target, observations=_pairs(tmp_path, lines))
     assert found.report["scale"] == pytest.approx(1, abs=1e-6)
@@ -98,8 +99,7 @@ def test_registering_again_changes_nothing_but_the_report(built, target, tmp_pat
     )
 
 
-def test_wrong_points_are_found_and_named(built, target, tmp_path, world_points):
-    lines = make_pairs(built.scene, world_points, np.random.default_rng(1))
+def test_wrong_points_are_found_and_named(built, target, tmp_path, lines):
     lines = [  # points 3 and 7 were measured elsewhere
         ",".join([*line.split(",")[:4], "1.0", "2.0", "9.0"])
         if line.startswith("p3,")
@@ -161,23 +161,17 @@ def test_too_few_points_or_points_on_a_line_are_refused_and_the_map_stays(
     assert [p.name for p in tmp_path.iterdir() if p.suffix == ".part"] == []
 
 
-def test_points_in_images_that_the_map_lacks_are_left_out_with_a_note(
-    built, target, tmp_path, world_points
-):
-    lines = make_pairs(built.scene, world_points, np.random.default_rng(1))
+def test_points_in_images_that_the_map_lacks_are_left_out_with_a_note(target, tmp_path, lines):
     lines = [line.replace("frame-", "other-") if line.startswith("p0,") else line for line in lines]
     _, found = register.register_map(target, observations=_pairs(tmp_path, lines))
     assert found.report["points"] == 11
     assert any("'p0' left out: 0 of its" in note for note in found.notes)
 
 
-def test_an_image_is_known_without_its_suffix_and_folder(built, target, tmp_path, world_points):
-    lines = make_pairs(built.scene, world_points, np.random.default_rng(1))
+def test_an_image_is_known_without_its_suffix_and_folder(target, tmp_path, lines):
     lines = [line.replace(",frame-", ",clicks/frame-") for line in lines]
-    assert (
-        register.register_map(target, observations=_pairs(tmp_path, lines))[1].report["points"]
-        == 12
-    )
+    _, found = register.register_map(target, observations=_pairs(tmp_path, lines))
+    assert found.report["points"] == 12
 
 
 @pytest.mark.parametrize(
@@ -226,17 +220,9 @@ def test_triangulation_scatters_as_its_covariance_says(built):
     predicted = np.linalg.inv(np.einsum("ski,skj->ij", J, J))
     ratio = np.linalg.eigvals(np.linalg.solve(predicted, scatter)).real
     assert (ratio > 0.6).all() and (ratio < 1.6).all()
-    model = Model(
-        names=[str(k) for k in range(6)],
-        image_id=np.arange(6) + 1,
-        wTc=T,
-        point_id=np.array([1]),
-        position=point[None],
-        image=np.arange(6),
-        feature=np.zeros(6, np.int64),
-        point=np.zeros(6, np.int64),
+    model = model_of(
+        camera, T, point[None], image=np.arange(6), point=np.zeros(6, np.int64),
         pixel_px=camera.undistort_to_pinhole(exact),
-        camera=camera,
-    )
+    )  # fmt: skip
     # There a pixel of the picture is one on the plane, to a few parts in a hundred.
     assert np.allclose(landmarks.covariances(model, 1.0)[0], predicted, rtol=0.1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -15,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hand_made import run
 
 from ground_station.errors import MapError
 from ground_station.geometry.trajectory import Trajectory
@@ -22,12 +22,6 @@ from ground_station.map import store
 from ground_station.mapping.registration import command
 
 ROOT = Path(__file__).parents[3]
-
-
-def run(*words: object) -> int:
-    parser = argparse.ArgumentParser()
-    command.add_arguments(parser)
-    return command.run(parser.parse_args([str(word) for word in words]))
 
 
 def test_the_uncertainty_is_printed_and_kept(built, target, tmp_path, capsys):
@@ -42,7 +36,7 @@ def test_the_uncertainty_is_printed_and_kept(built, target, tmp_path, capsys):
             for t, p, q in zip(poses.time_ns, poses.position_m, poses.quaternion_xyzw, strict=True)
         )
     )
-    assert run(target, "--trajectory", path, "--json", tmp_path / "r.json") == 0
+    assert run(command, target, "--trajectory", path, "--json", tmp_path / "r.json") == 0
     printed = capsys.readouterr().out
     assert "expected error at the middle of the map: " in printed and "cm in 90 %" in printed
     assert "its worst corner" in printed and "scale_sigma_percent" in printed
@@ -69,7 +63,7 @@ def test_the_uncertainty_is_printed_and_kept(built, target, tmp_path, capsys):
 )
 def test_what_does_not_go_together_is_refused_in_one_line(target, words, says):
     with pytest.raises(MapError, match=says.replace("(", r"\(")) as caught:
-        run(target, *(word.format(map=target) for word in words))
+        run(command, target, *(word.format(map=target) for word in words))
     assert "\n" not in str(caught.value)
     assert not store.load_info(target).registered
 

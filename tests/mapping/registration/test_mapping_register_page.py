@@ -89,10 +89,8 @@ class Stand:
 
 
 @pytest.fixture
-def stand(built: Any, tmp_path: Path) -> Iterator[Stand]:
-    folder = tmp_path / "map"
-    shutil.copytree(built.folder, folder)
-    one = Stand(folder, draw_plan(tmp_path), built)
+def stand(built: Any, target: Path, tmp_path: Path) -> Iterator[Stand]:
+    one = Stand(target, draw_plan(tmp_path), built)
     yield one
     one.stop()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 
 import numpy as np
 import pytest
@@ -250,10 +249,8 @@ def test_a_plan_is_the_maps_own_or_a_picture_with_its_scale(tmp_path):
             scaled.with_distance(*pair, length)
 
 
-def test_a_map_on_disk_is_registered_by_picks(built, tmp_path):
+def test_a_map_on_disk_is_registered_by_picks(built, target):
     """Through the same door as all else, and its uncertainty is kept with it."""
-    folder = tmp_path / "map"
-    shutil.copytree(built.folder, folder)
     map_, scene = built.map, built.scene
     from ground_station.geometry.alignment import align
 
@@ -270,10 +267,10 @@ def test_a_map_on_disk_is_registered_by_picks(built, tmp_path):
         (np.array([8, 6, 0.0]) - truth.translation) @ truth.rotation / truth.scale @ up.direction
     )
     up = dataclasses.replace(up, level=level)
-    moved, found = register_map(folder, picks=Picks(made, SCALE, up), source="PICKS.toml")
+    moved, found = register_map(target, picks=Picks(made, SCALE, up), source="PICKS.toml")
     off = np.linalg.norm(moved.keyframes.wTc[:, :3, 3] - scene.wTc[:, :3, 3], axis=1)
     assert off.max() < 0.05
-    kept = store.load_info(folder).registration
+    kept = store.load_info(target).registration
     assert kept["method"] == "picks" and kept["source"] == "PICKS.toml"
     assert kept["corner_90_percent_m"] >= kept["centre_90_percent_m"] > 0
     assert kept == found.report | {"source": "PICKS.toml", "seed": 0}

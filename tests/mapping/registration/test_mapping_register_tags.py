@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from built_scene import look_at
+from hand_made import keyframes_of
 from known_places import in_map, similarity
 
 from ground_station.errors import MapError
@@ -105,20 +106,9 @@ def flight():
     own = wTc.copy()
     own[:, :3, :3] = TRUTH.rotation.T @ wTc[:, :3, :3]
     own[:, :3, 3] = in_map(TRUTH, wTc[:, :3, 3])
-    map_ = SimpleNamespace(
-        info=SimpleNamespace(camera=CAMERA),
-        keyframes=Keyframes([f.name for f in frames], own),
-    )
+    info = SimpleNamespace(camera=CAMERA, built={"rate_hz": 5.0})
+    map_ = SimpleNamespace(info=info, keyframes=keyframes_of(own, 10**8))
     return SimpleNamespace(map=map_, frames=frames, wTc=wTc, rays=rays)
-
-
-@dataclasses.dataclass
-class Keyframes:
-    names: list[str]
-    wTc: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.names)
 
 
 @pytest.fixture
@@ -238,15 +228,17 @@ def test_the_wrong_family_frames_or_size_are_refused(flight, listed):
         find_tags(flight.map, listed, small)
 
 
+def named(map_: SimpleNamespace, form: str) -> SimpleNamespace:
+    """The map whose images are called otherwise."""
+    names = [form.format(name) for name in map_.keyframes.names]
+    keyframes = dataclasses.replace(map_.keyframes, names=names)
+    return SimpleNamespace(info=map_.info, keyframes=keyframes)
+
+
 def test_images_of_a_map_of_several_inputs_have_the_inputs_name(flight, listed):
-    names = [f"walk/{name}" for name in flight.map.keyframes.names]
-    map_ = SimpleNamespace(
-        info=flight.map.info, keyframes=Keyframes(names, flight.map.keyframes.wTc)
-    )
-    assert (
-        find_tags(map_, listed, flight.frames[:3], ["walk"]).observations.image[0]
-        == "walk/frame-000000"
-    )
+    map_ = named(flight.map, "walk/{}")
+    seen = find_tags(map_, listed, flight.frames[:3], ["walk"])
+    assert seen.observations.image[0] == "walk/frame-000000"
 
 
 def test_a_folder_of_frames_is_looked_through(flight, tmp_path, monkeypatch, capsys):
@@ -256,13 +248,11 @@ def test_a_folder_of_frames_is_looked_through(flight, tmp_path, monkeypatch, cap
     for frame in flight.frames[:4]:
         cv2.imwrite(str(folder / f"{frame.name}.png"), frame.image)
     (tmp_path / "TAGS.toml").write_text(TOML)
-    names = [f"{name}.png" for name in flight.map.keyframes.names]
-    info = SimpleNamespace(camera=CAMERA, built={"rate_hz": 5.0})
-    map_ = SimpleNamespace(info=info, keyframes=Keyframes(names, flight.map.keyframes.wTc))
+    map_ = named(flight.map, "{}.png")
     monkeypatch.setattr(store, "load", lambda _: map_)
     args = argparse.Namespace(map="m", tags=tmp_path / "TAGS.toml", frames=[str(folder)])
     seen = command._seen_tags(args)
-    assert set(seen.observations.image) == set(names[:4]) and not seen.notes
+    assert set(seen.observations.image) == set(map_.keyframes.names[:4]) and not seen.notes
 
 
 @pytest.mark.parametrize(
