@@ -44,6 +44,25 @@ def test_all_of_a_map_is_on_the_disk_before_it_takes_the_old_one_s_place(
     assert (target / "gone").is_symlink()
 
 
+def test_a_map_comes_into_a_folder_of_recordings_and_not_into_one_of_other_things(
+    tmp_path: Path,
+) -> None:
+    sample = tmp_path / "sample"
+    sample.mkdir()
+    (sample / "flight.mcap").write_text("recording")
+    with folders.replacing(sample) as part:
+        (part / "map.toml").write_text("new")
+    assert {p.name: p.read_text() for p in sample.iterdir()} == {
+        "flight.mcap": "recording", "map.toml": "new",
+    }  # fmt: skip
+    (tmp_path / "mine" / "sparse").mkdir(parents=True)
+    (tmp_path / "file").touch()
+    for name, words in (("mine", "is not a map"), ("file", "not a folder")):
+        with pytest.raises(MapError, match=words), folders.replacing(tmp_path / name):
+            pass
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "mine", "sample"]
+
+
 def test_two_programs_do_not_write_one_map(tmp_path: Path) -> None:
     target = tmp_path / "hall"
     part = tmp_path / "hall.part"

@@ -64,21 +64,6 @@ def test_a_picture_of_another_size_is_named_and_what_came_before_it_is_kept(tmp_
     assert _refused(tmp_path, frames(), MapError, "frame-3").features_found == 3
 
 
-def test_a_disk_that_is_full_for_the_cache_does_not_stop_a_build(
-    built, use_scene, tmp_path, capsys
-):
-    use_scene(built.scene)
-    with Cache(tmp_path / "cache") as cache:
-        pages = cache._db.execute("PRAGMA page_count").fetchone()[0]
-        cache._db.execute(f"PRAGMA max_page_count = {pages + 20}")
-        map_ = build.build_map(
-            built.scene.frames(), built.scene.camera, built.settings, tmp_path / "map", cache=cache
-        )
-    assert map_.keyframes.names == built.map.keyframes.names
-    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("cache")]
-    assert len(said) == 1 and "full" in said[0] and "goes on without it" in said[0]
-
-
 @pytest.mark.parametrize("stage", ["reconstruct", "assemble"])
 def test_a_disk_that_is_full_for_the_map_is_one_line_and_the_cache_is_kept(
     built, use_scene, tmp_path, monkeypatch, stage

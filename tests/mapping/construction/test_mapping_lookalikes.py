@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import corridor_geometry as geometry
 import numpy as np
@@ -35,13 +34,8 @@ def plain(corridor, tmp_path_factory) -> colmap.Reconstruction:
 
 
 @pytest.fixture(scope="module")
-def work(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("judged")
-
-
-@pytest.fixture(scope="module")
-def judged(corridor, work) -> structure.Structure:
-    return _judged(corridor, work)
+def judged(corridor, tmp_path_factory) -> structure.Structure:
+    return _judged(corridor, tmp_path_factory.mktemp("judged"))
 
 
 def _plain(corridor, pairs, work) -> colmap.Reconstruction:
@@ -118,19 +112,6 @@ def test_a_model_of_the_chain_tells_the_way_back_from_the_next_bay(corridor, tmp
     true = set(corridor.pairs) - corridor.misled
     assert len(believed) > 0.9 * len(true)
     assert len(believed - links) > 100  # among them those of the way back
-
-
-def test_a_build_that_goes_on_from_all_that_was_done_ends_in_the_same_places(
-    corridor, judged, work, monkeypatch
-):
-    def never(*_):
-        raise AssertionError("structure from motion that was finished ran again")
-
-    monkeypatch.setattr(Incremental, "_batch", never)
-    again = colmap.to_arrays(_judged(corridor, work).reconstruction)
-    before = colmap.to_arrays(judged.reconstruction)
-    assert again.names == before.names
-    assert np.abs(again.wTc - before.wTc).max() < 1e-6
 
 
 def _cut_at_the_turn() -> geometry.Corridor:

@@ -1,4 +1,4 @@
-"""Matches, two-view geometry and the choice of pairs."""
+"""Matches and two-view geometry."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from ground_station.geometry.camera import Camera
 from ground_station.mapping.construction.matching import mutual_matches, verify
-from ground_station.mapping.construction.pairs import choose_pairs, vlad
 from ground_station.mapping.settings import MatchSettings
 
 CAMERA = Camera()
@@ -92,19 +91,3 @@ def test_planes_and_pure_turns_are_called_degenerate():
 def test_too_few_matches_have_no_geometry():
     assert _verify(np.zeros((5, 2)), np.zeros((5, 2))) is None
     assert _verify(np.full((40, 2), 7.0), np.full((40, 2), 7.0)) is None
-
-
-def test_few_images_are_all_compared_and_many_with_neighbours_and_look_alikes():
-    rng = np.random.default_rng(4)
-    places = [_unit(rng.normal(size=(60, 16))) for _ in range(30)]
-    # The second half returns to the places of the first.
-    images = [_unit(p + 0.05 * rng.normal(size=p.shape)) for p in places + places]
-    settings = MatchSettings(exhaustive_max=40, neighbours=3, similar=2)
-    assert len(choose_pairs(images[:40], settings, 0)) == 40 * 39 // 2
-    pairs = choose_pairs(images, settings, 0)
-    assert all(i < j for i, j in pairs) and len(set(pairs)) == len(pairs)
-    assert {(i, i + d) for i in range(57) for d in (1, 2, 3)} <= set(pairs)
-    assert {(i, i + 30) for i in range(30)} <= set(pairs)
-    assert len(pairs) < 60 * 5
-    assert pairs == choose_pairs(images, settings, 0)
-    assert np.allclose(np.linalg.norm(vlad(images, 0), axis=1), 1, atol=1e-5)

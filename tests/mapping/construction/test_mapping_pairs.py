@@ -59,16 +59,19 @@ def test_images_of_two_inputs_that_look_alike_are_compared():
     settings = MatchSettings(exhaustive_max=2, neighbours=1, similar=1)
     pairs = choose_pairs(places + again, settings, 0, np.repeat([0, 1], 6))
     assert {(k, k + 6) for k in range(6)} <= set(pairs)
+    assert pairs == sorted(set(pairs)) and all(i < j for i, j in pairs) and len(pairs) <= 12 * 2
+    assert pairs == choose_pairs(places + again, settings, 0, np.repeat([0, 1], 6))
     # The end of one and the beginning of the other are compared only if they look alike.
     unlike = choose_pairs(_images(4), MatchSettings(exhaustive_max=2, neighbours=1, similar=0), 0,
                           np.array([0, 0, 1, 1]))  # fmt: skip
     assert unlike == [(0, 1), (2, 3)]
 
 
-def test_every_pair_is_compared_by_choice():
+def test_every_pair_is_compared_by_choice_and_of_few_images():
     images = _images(9)
-    chosen = choose_pairs(images, MatchSettings(pairs="exhaustive", exhaustive_max=2), 0)
-    assert chosen == [(i, j) for i in range(9) for j in range(i + 1, 9)]
+    for settings in (MatchSettings(pairs="exhaustive", exhaustive_max=2), MatchSettings()):
+        chosen = choose_pairs(images, settings, 0)
+        assert chosen == [(i, j) for i in range(9) for j in range(i + 1, 9)]
 
 
 def test_images_without_features_are_like_nothing():

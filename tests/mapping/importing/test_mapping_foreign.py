@@ -139,17 +139,15 @@ def refused_or_whole(folder):
     return False
 
 
+@pytest.mark.parametrize("written", ["text"], indirect=True)
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_a_file_that_is_cut_is_refused(copy, name, monkeypatch):
-    monkeypatch.setattr(colmap_files, "_SECONDS", 1)  # a count may ask for as long as it gets
-    path = next(copy.glob(f"{name}.*"))
+def test_a_text_file_that_is_cut_is_refused(copy, name):
+    """Binary ones are cut in the tests of maps' own."""
+    path = copy / f"{name}.txt"
     whole = path.read_bytes()
-    refused = 0
-    sizes = np.unique(np.linspace(0, len(whole) - 1, 5).astype(int)).tolist()
-    for size in sizes:
+    for size in (0, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:size])
-        refused += refused_or_whole(copy)
-    assert refused == len(sizes)
+        assert refused_or_whole(copy)
     path.unlink()
     with pytest.raises(MapError, match="COLMAP model" if name != "cameras" else "no cameras.bin"):
         foreign.read(copy)
