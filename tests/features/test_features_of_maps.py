@@ -16,6 +16,7 @@ from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.localization.extraction import extractor_for
 from ground_station.map.store import MapInfo
 from ground_station.mapping.construction import images, verification
+from ground_station.mapping.construction.workers import Threads
 from ground_station.mapping.settings import MappingSettings
 from ground_station.recording.frames import Frame
 
@@ -74,7 +75,7 @@ def test_a_map_of_a_model_that_is_not_here_is_refused_with_those_that_are(bird, 
 def test_a_map_is_built_with_a_model_by_name_on_several_threads(bird):
     frames = frames_of_noise(5)
     settings = MappingSettings(features="bird", max_features=50)
-    found = images.extract(frames, CAMERA, settings, 2, 5)
+    found = images.extract(frames, CAMERA, settings, Threads(2), 5)
     alone = extractors.create("bird", 50)
     for frame, features in zip(frames, found.features, strict=True):
         assert features.descriptors.shape[1] == 16 and len(features) > 10
@@ -97,9 +98,9 @@ def test_ratio_and_pairs_are_rootsifts_and_other_features_have_their_own(bird, m
     monkeypatch.setattr(verification.choice, "choose_pairs", chosen)
     for name in ("rootsift", "bird"):
         settings = MappingSettings(features=name, max_features=50)
-        found = images.extract(frames_of_noise(2), CAMERA, settings, 1, 2)
+        found = images.extract(frames_of_noise(2), CAMERA, settings, Threads(1), 2)
         with pytest.raises(MapError, match="no two of the 2 images overlap"):
-            verification.match(found, CAMERA, settings, 1)
+            verification.match(found, CAMERA, settings, Threads(1))
     wanted = settings.match
     assert ratios == [wanted.ratio, wanted.ratio_others] == [0.8, 0.95]
     assert similar == [wanted.similar, wanted.similar_others] == [8, 20]

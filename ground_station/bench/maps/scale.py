@@ -64,7 +64,7 @@ def build(images: int, dask: int, settings: MappingSettings) -> Row:
         before_s = _cpu_s()
         with open_workers(str(dask) if dask else None, threads, settings) as workers:
             start_s = time.monotonic()
-            pairs = match(given, CAMERA, settings, threads, workers=workers)
+            pairs = match(given, CAMERA, settings, workers)
             stage_s["match"] = time.monotonic() - start_s
             start_s = time.monotonic()
             structure = reconstruct(given, pairs, CAMERA, settings, threads, work, workers)

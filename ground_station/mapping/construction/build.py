@@ -92,8 +92,7 @@ def build_map(
     with ExitStack() as own, replacing(out) as folder:
         with _timed(stage_s, "features"):
             images = extract(
-                frames, camera, settings, threads, total,
-                cache=cache, workers=workers, folder=folder / "work",
+                frames, camera, settings, workers, total, cache=cache, folder=folder / "work",
             )  # fmt: skip
         # A camera that somebody gives without a word on its lens is a calibrated one.
         lens = SelfCalibration(prior or LensPrior(camera, "file", 0.0), images, settings)
@@ -107,10 +106,7 @@ def build_map(
             with _timed(stage_s, "match"):
                 seen = noise.measured(images, camera, limits.match.of(limits.features).ratio)
                 limits = _with_noise(limits, seen)
-                pairs = match(
-                    images, camera, limits, threads,
-                    cache=cache, workers=workers, matched=matched,
-                )  # fmt: skip
+                pairs = match(images, camera, limits, workers, cache=cache, matched=matched)
             work = None
             if cache:
                 key = structure_key(images, pairs, camera, limits)

@@ -19,7 +19,7 @@ from ground_station.geometry.resizing import misfit
 from ground_station.mapping.construction import content
 from ground_station.mapping.construction.cache import Cache
 from ground_station.mapping.construction.feature_file import FeatureFile
-from ground_station.mapping.construction.workers import Threads, Workers
+from ground_station.mapping.construction.workers import Workers
 from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
 from ground_station.recording.frames import Frame
@@ -46,11 +46,10 @@ def extract(
     frames: Iterable[Frame],
     camera: Camera,
     settings: MappingSettings,
-    threads: int,
+    workers: Workers,
     total: int | None,
     *,
     cache: Cache | None = None,
-    workers: Workers | None = None,
     folder: Path | None = None,
 ) -> Images:
     """Features of all frames, extracted in parallel while the input is read.
@@ -95,7 +94,7 @@ def extract(
                 keep(k, features)
 
     with Progress("features, images", total) as progress:
-        for features in (workers or Threads(threads)).map(extract_features, missing()):
+        for features in workers.map(extract_features, missing()):
             k = under_way.popleft()
             if cache:
                 cache.keep_features(keys[k], features)

@@ -20,7 +20,7 @@ from ground_station.mapping.construction.feature_file import KeptFeatures, KeptS
 from ground_station.mapping.construction.images import Images
 from ground_station.mapping.construction.matching import mutual_matches, verify
 from ground_station.mapping.construction.pairs import Pair
-from ground_station.mapping.construction.workers import Threads, Workers
+from ground_station.mapping.construction.workers import Workers
 from ground_station.mapping.settings import MappingSettings, MatchSettings
 from ground_station.mapping.sfm.two_view import TwoView
 from ground_station.progress import Progress
@@ -51,10 +51,9 @@ def match(
     images: Images,
     camera: Camera,
     settings: MappingSettings,
-    threads: int,
+    workers: Workers,
     *,
     cache: Cache | None = None,
-    workers: Workers | None = None,
     matched: dict[Pair, U16] | None = None,
 ) -> dict[Pair, TwoView]:
     """Verified pairs (i, j) of images; raises `MapError` when no two images overlap.
@@ -67,7 +66,6 @@ def match(
     sequence = choice.sequences(images.names, images.time_ns)
     wanted = settings.match.of(settings.features)
     chosen = choice.choose_pairs(descriptors, wanted, settings.seed, sequence)
-    workers = workers or Threads(threads)
     kept = images.features
     if isinstance(kept, KeptFeatures) and workers.here:
         sharing: AbstractContextManager[Sequence[Any]] = nullcontext(kept.sides(images.pinhole_px))

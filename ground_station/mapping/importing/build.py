@@ -161,7 +161,7 @@ def import_model(
     threads = settings.threads or os.cpu_count() or 1
     started_s = time.monotonic()
     with replacing(out) as folder:
-        images = extract(frames, camera, settings, threads, len(model.names))
+        images = extract(frames, camera, settings, Threads(threads), len(model.names))
         place = {name: k for k, name in enumerate(model.names)}
         rows = [place[name] for name in images.names]
         wTc = model.wTc[rows]

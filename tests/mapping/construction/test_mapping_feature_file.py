@@ -113,13 +113,13 @@ class _FarAway(Threads):
 def test_structure_from_motion_starts_from_the_same_wherever_features_lie(tmp_path):
     source = open_input(SAMPLE, 30.0, parse_range("0:6"))
     frames, camera = list(source), source.camera
-    memory = extract(frames, camera, SETTINGS, 2, None)
-    disk = extract(frames, camera, SETTINGS, 2, None, folder=tmp_path)
+    memory = extract(frames, camera, SETTINGS, Threads(2), None)
+    disk = extract(frames, camera, SETTINGS, Threads(2), None, folder=tmp_path)
     assert all(_same(a, b) for a, b in zip(memory.features, disk.features, strict=True))
-    expected = structure_key(memory, match(memory, camera, SETTINGS, 2), camera, SETTINGS)
+    expected = structure_key(memory, match(memory, camera, SETTINGS, Threads(2)), camera, SETTINGS)
     far = _FarAway()
     for workers in (Threads(2), far):
-        pairs = match(disk, camera, SETTINGS, 2, workers=workers)
+        pairs = match(disk, camera, SETTINGS, workers)
         assert structure_key(disk, pairs, camera, SETTINGS) == expected
     assert far.sent > 300 * 128 * 4  # the descriptors themselves
 
@@ -128,15 +128,15 @@ def test_what_descriptors_say_of_a_pair_is_asked_once_whatever_the_lens(monkeypa
     source = open_input(SAMPLE, 30.0, parse_range("0:24"))
     camera = source.camera
     longer = dataclasses.replace(camera, fx_px=1.05 * camera.fx_px, fy_px=1.05 * camera.fy_px)
-    images = extract(list(source), camera, SETTINGS, 2, None)
+    images = extract(list(source), camera, SETTINGS, Threads(2), None)
     matched: dict[tuple[int, int], np.ndarray] = {}
-    first = match(images, camera, SETTINGS, 2, matched=matched)
+    first = match(images, camera, SETTINGS, Threads(2), matched=matched)
     unlike = {pair for pair, matches in matched.items() if not len(matches)}
     assert len(unlike) > 20 and first.keys() <= matched.keys() - unlike
     images = with_lens(images, longer)
-    fresh = match(images, longer, SETTINGS, 2)
+    fresh = match(images, longer, SETTINGS, Threads(2))
     monkeypatch.setattr(verification, "mutual_matches", None)
-    again = match(images, longer, SETTINGS, 2, matched=matched)
+    again = match(images, longer, SETTINGS, Threads(2), matched=matched)
     assert structure_key(images, again, longer, SETTINGS) == structure_key(
         images, fresh, longer, SETTINGS
     )

@@ -208,7 +208,7 @@ def hall():
     names = [f"{k:03d}" for k in range(IMAGES)]
     pixels = [CAMERA.undistort_to_pinhole(each.keypoints_px) for each in features]
     images = Images(names, made.time_ns, features, pixels)
-    return images, match(images, CAMERA, SETTINGS, 2), made.wTc
+    return images, match(images, CAMERA, SETTINGS, Threads(2)), made.wTc
 
 
 def _error_m(model, wTc):

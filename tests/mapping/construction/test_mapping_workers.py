@@ -248,16 +248,16 @@ def _lost_while_under_way(workers, died):
 
 def test_two_processes_make_the_same_as_threads_and_one_may_die(sample_frames, tmp_path):
     frames, camera = sample_frames
-    alone = extract(frames, camera, SETTINGS, 2, None)
-    pairs = match(alone, camera, SETTINGS, 2)
+    alone = extract(frames, camera, SETTINGS, Threads(2), None)
+    pairs = match(alone, camera, SETTINGS, Threads(2))
     assert len(pairs) > 3
     expected = structure_key(alone, pairs, camera, SETTINGS)
     with open_workers("2", 2, SETTINGS) as workers:
         assert workers.name == "Dask on this machine, 2 workers"
         assert workers.here
         for folder in (None, tmp_path):
-            images = extract(frames, camera, SETTINGS, 2, None, workers=workers, folder=folder)
-            found = match(images, camera, SETTINGS, 2, workers=workers)
+            images = extract(frames, camera, SETTINGS, workers, None, folder=folder)
+            found = match(images, camera, SETTINGS, workers)
             # Structure from motion would start from the same, to the bit.
             assert structure_key(images, found, camera, SETTINGS) == expected
         masks = workers._client.run(signal.pthread_sigmask, signal.SIG_BLOCK, [])
@@ -266,7 +266,7 @@ def test_two_processes_make_the_same_as_threads_and_one_may_die(sample_frames, t
         assert _lost_while_under_way(workers, died) == [1000 + k for k in range(48)]
         assert died
         with pytest.raises(InputError, match="at least 2 frames"):
-            extract(frames[:1], camera, SETTINGS, 2, None, workers=workers)
+            extract(frames[:1], camera, SETTINGS, workers, None)
 
 
 @pytest.fixture
