@@ -46,6 +46,11 @@ def transform(aTb: npt.ArrayLike, points_b: npt.ArrayLike) -> F64:
     return np.asarray(np.asarray(points_b) @ T[:3, :3].T + T[:3, 3])
 
 
+def in_each(wTc: F64, points_w: F64) -> F64:
+    """Points (N, 3) of the world, or one (3,), each in the axes of its camera of N (N, 4, 4)."""
+    return np.asarray(np.einsum("oji,oj->oi", wTc[:, :3, :3], points_w - wTc[:, :3, 3]))
+
+
 def exp(xi: npt.ArrayLike) -> F64:
     """SE(3) exponential (4, 4) of a tangent vector (6,), rotation first."""
     import gtsam  # here, and below: four tenths of a second for who has no tangent vectors

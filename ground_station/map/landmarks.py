@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ground_station.arrays import F32, F64, I64
+from ground_station.geometry import poses
 from ground_station.map.model import Model
 from ground_station.map.store import Landmarks
 
@@ -24,10 +25,7 @@ def residuals_px(model: Model) -> F64:
 
 def in_cameras(model: Model) -> F64:
     """The points of all observations (O, 3), each in the axes of the camera that made it."""
-    T = model.wTc[model.image]
-    return np.asarray(
-        np.einsum("oji,oj->oi", T[:, :3, :3], model.position[model.point] - T[:, :3, 3])
-    )
+    return poses.in_each(model.wTc[model.image], model.position[model.point])
 
 
 def largest_angles_deg(model: Model) -> F64:

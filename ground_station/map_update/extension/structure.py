@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ground_station.arrays import F64, I64, Bools, Indices
+from ground_station.geometry import poses
 from ground_station.localization.relocalization import pose_from_matches
 from ground_station.localization.settings import RecoverySettings
 from ground_station.map import landmarks
@@ -185,7 +186,7 @@ class Structure:
 
     def _off_px(self, frame: I64, feature: I64, key: I64) -> F64:
         """Reprojection errors (N,) in posed frames; inf behind the camera, NaN of no position."""
-        X = shutter.in_cameras(self.wTc[frame], self._where(key))
+        X = poses.in_each(self.wTc[frame], self._where(key))
         pixel = self._pixels(frame, feature, X[:, 2])
         with np.errstate(divide="ignore", invalid="ignore"):
             projected = X[:, :2] / X[:, 2:] * self._pinhole[:2] + self._pinhole[2:]
@@ -215,7 +216,7 @@ class Structure:
         posed = np.flatnonzero(self.posed)
         keys, point = np.unique(key, return_inverse=True)
         if depth is None:
-            depth = shutter.in_cameras(self.wTc[frame], self._where(key))[:, 2]
+            depth = poses.in_each(self.wTc[frame], self._where(key))[:, 2]
         return Model(
             names=[self.frames.names[k] for k in posed.tolist()],
             image_id=posed + 1,

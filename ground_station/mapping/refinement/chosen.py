@@ -112,7 +112,7 @@ def _against(seen: FlightObservations, map_: Map) -> tuple[I64, F64, F64, Bools]
     pixel_px, usable = by_lens(seen.pixel_px, seen.camera, camera)
     with np.errstate(invalid="ignore", over="ignore"):
         frame = np.repeat(np.arange(len(seen)), np.diff(seen.offset))
-        X = shutter.in_cameras(seen.wTc[frame], lm.position_m[landmark])
+        X = poses.in_each(seen.wTc[frame], lm.position_m[landmark])
     usable &= (lm.id[landmark] == seen.landmark) & np.isfinite(X).all(axis=1) & (X[:, 2] > 0)
     return landmark, X, pixel_px, usable
 

@@ -83,13 +83,8 @@ def shifts_px(
     if camera.readout_s > 0:
         twist[order] = twists(time_ns[order], wTc[order], 0.0, gap_s)
     known = np.isfinite(twist[image]).all(axis=1)
-    X = in_cameras(wTc[image[known]], points_w[known])
+    X = poses.in_each(wTc[image[known]], points_w[known])
     row_s = row_times_s(pixel_px[known, 1], camera)
     shift = np.zeros((len(image), 2))
     shift[known] = np.nan_to_num(shift_px(X, twist[image[known]], row_s, camera))
     return shift, int(np.isfinite(twist).all(axis=1).sum())
-
-
-def in_cameras(wTc: F64, points_w: F64) -> F64:
-    """Points (N, 3) of the world in the axes of N cameras (N, 4, 4), each in its own."""
-    return np.asarray(np.einsum("oji,oj->oi", wTc[:, :3, :3], points_w - wTc[:, :3, 3]))

@@ -252,14 +252,13 @@ def reproject(X: F64, wTc: F64, rays: F64, camera: Camera) -> tuple[F64, F64]:
     Points at or behind a camera give NaN.
     """
     f = np.array([camera.fx_px, camera.fy_px])
-    R = wTc[:, :3, :3]
-    c = np.einsum("sji,sj->si", R, X - wTc[:, :3, 3])
+    c = poses.in_each(wTc, X)
     z = np.where(c[:, 2:] > 0, c[:, 2:], np.nan)
     xy = c[:, :2] / z
     J = np.zeros((len(wTc), 2, 3))
     J[:, 0, 0] = J[:, 1, 1] = 1.0 / z[:, 0]
     J[:, :, 2] = -xy / z
-    J = J * f[:, None] @ np.swapaxes(R, 1, 2)
+    J = J * f[:, None] @ np.swapaxes(wTc[:, :3, :3], 1, 2)
     return (rays - xy) * f, J
 
 
