@@ -58,14 +58,9 @@ class Visibility:
     `rows` (M,) are the map's landmarks that are looked at, each of which stands for `weight`.
     """
 
-    def __init__(
-        self,
-        map_: Map,
-        most_landmarks: int = MOST_LANDMARKS,
-        most_keyframes: int = MOST_KEYFRAMES,
-    ) -> None:
+    def __init__(self, map_: Map) -> None:
         lm, kf = map_.landmarks, map_.keyframes
-        step = max(1, -(-len(lm) // most_landmarks))
+        step = max(1, -(-len(lm) // MOST_LANDMARKS))
         self.rows = np.arange(0, len(lm), step)
         self.weight = len(lm) / max(len(self.rows), 1)
         self.position = lm.position_m[self.rows]
@@ -75,7 +70,7 @@ class Visibility:
         landmark: list[I64] = []
         ray: list[F64] = []
         seen: list[Bools] = []
-        for k in range(0, len(kf), max(1, -(-len(kf) // most_keyframes))):
+        for k in range(0, len(kf), max(1, -(-len(kf) // MOST_KEYFRAMES))):
             here = np.zeros(len(self.rows), bool)
             observations = at[kf.landmark[kf.offset[k] : kf.offset[k + 1]]]
             here[observations[observations >= 0]] = True

@@ -12,7 +12,7 @@ from ground_station.arrays import F64
 from ground_station.errors import MapError
 from ground_station.map.store import MapInfo
 
-PROBABILITY = 0.9
+_PROBABILITY = 0.9
 _REGION = (0.01, 0.99)
 """Quantiles of the landmarks' coordinates that bound the mapped region: single ones lie outside."""
 
@@ -59,8 +59,8 @@ class Uncertainty:
         """Expected (RMS) position error at places (N, 3), metres, in three dimensions."""
         return np.asarray(np.sqrt(np.trace(self.at(places), axis1=1, axis2=2)))
 
-    def radius_m(self, places: F64, probability: float = PROBABILITY) -> F64:
-        """Radius (N,), metres, of the sphere that holds the position error so often.
+    def radius_m(self, places: F64) -> F64:
+        """Radius (N,), metres, of the sphere that holds the position error in 90 %.
 
         The squared error over its mean is distributed as chi-square over its degrees of freedom, h
         of them (Box, "Some theorems on quadratic forms applied in the study of analysis of variance
@@ -71,7 +71,7 @@ class Uncertainty:
         total = spread.sum(axis=1)
         squares = np.maximum(np.sum(spread**2, axis=1), np.finfo(float).tiny)
         h = np.clip(total**2 / squares, 1.0, 3.0)
-        return np.asarray(np.sqrt(total * fdtri(h, self.freedom, probability)))
+        return np.asarray(np.sqrt(total * fdtri(h, self.freedom, _PROBABILITY)))
 
 
 def region(positions: F64) -> tuple[F64, F64]:

@@ -12,6 +12,7 @@ from rooms_map import SIDE_M, looking, made_of, two_rooms, wall
 from ground_station.errors import MapError
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
+from ground_station.inspection import prediction
 from ground_station.inspection.localizability import localizability
 from ground_station.inspection.prediction import MOST, NEEDED, SIGMA_PX, Predictor, View, Visibility
 from ground_station.localization.settings import load_preset
@@ -145,8 +146,11 @@ def test_a_map_without_a_world_is_turned_upright(rooms):
     assert levelled(rooms) is rooms
 
 
-def test_a_large_map_is_thinned_to_the_same_answer(rooms):
-    whole, few = Visibility(rooms), Visibility(rooms, most_landmarks=200, most_keyframes=9)
+def test_a_large_map_is_thinned_to_the_same_answer(rooms, monkeypatch):
+    whole = Visibility(rooms)
+    monkeypatch.setattr(prediction, "MOST_LANDMARKS", 200)
+    monkeypatch.setattr(prediction, "MOST_KEYFRAMES", 9)
+    few = Visibility(rooms)
     assert len(few.rows) == 200 and few.weight == 3
     place = [2.0, 3.0, 1.5]
     assert few.weight * few.chance(place).sum() == pytest.approx(whole.chance(place).sum(), rel=0.2)

@@ -93,11 +93,10 @@ def extend_map(
     out: str | Path | None = None,
     rate_hz: float = 30.0,
     frame_range: FrameRange | None = None,
-    localizer: LocalizerSettings | None = None,
 ) -> tuple[store.Map, Extension]:
     """Adds recordings, videos or folders to a map on disk; to `out`, or in its place.
 
-    Each is localized in the map (`localizer`: the default preset). Frames beside localized ones
+    Each is localized in the map, with the default preset. Frames beside localized ones
     follow from what they share with them, new landmarks are triangulated, and old ones get further
     descriptors where they look otherwise. Landmarks and keyframes of the map stay where they are,
     and nothing is removed. In place, the old map is kept beside it (NAME.before); the new one
@@ -105,7 +104,7 @@ def extend_map(
     another size or is in it already.
     """
     settings, folder = settings or MappingSettings(), Path(folder)
-    localizer = localizer or load_preset("default")
+    localizer = load_preset("default")
     threads = settings.threads or os.cpu_count() or 1
     target = folder if out is None else Path(out)
     check_target(target.absolute())
