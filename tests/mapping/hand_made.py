@@ -23,6 +23,11 @@ def run(command: ModuleType, *words: object) -> int:
     return int(command.run(parser.parse_args([str(word) for word in words])))
 
 
+def content(folder: Path) -> dict[str, bytes]:
+    """All files in a folder and below it, by name."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
 def camera_file(path: Path, camera: Camera) -> str:
     """Writes a camera file; gives its path."""
     lines = (f"{key} = {value!r}\n" for key, value in camera.as_dict().items())

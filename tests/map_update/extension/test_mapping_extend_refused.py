@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from corridor_light import RATE_HZ, SETTINGS
-from hand_made import NO_KEYFRAMES, run
+from hand_made import NO_KEYFRAMES, content, run
 
 from ground_station.commands import maps
 from ground_station.errors import InputError, MapError
@@ -40,10 +40,6 @@ def folder(corridor_world, tmp_path) -> Path:
     return shutil.copytree(corridor_world.folder, tmp_path / "map")
 
 
-def _content(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-
-
 def _pictures(folder: Path, size=(480, 640), number=255, count=4) -> Path:
     folder.mkdir()
     image = np.zeros(size, np.uint8)
@@ -55,7 +51,7 @@ def _pictures(folder: Path, size=(480, 640), number=255, count=4) -> Path:
 
 def test_an_input_that_cannot_join_is_one_line(corridor_world, tmp_path):
     world, out = corridor_world, tmp_path / "out"
-    before = _content(world.folder)
+    before = content(world.folder)
     sunset, elsewhere = world.flights["sunset"], tmp_path / "elsewhere"
     elsewhere.mkdir()
     for path in sorted(world.flights["elsewhere"].iterdir())[-3:]:
@@ -72,7 +68,7 @@ def test_an_input_that_cannot_join_is_one_line(corridor_world, tmp_path):
         with pytest.raises(kind, match=words) as caught:
             _extend(world, out, *inputs)
         assert "\n" not in str(caught.value)
-    assert not out.exists() and _content(world.folder) == before
+    assert not out.exists() and content(world.folder) == before
 
 
 def test_another_camera_is_refused_by_its_size_before_a_frame_is_read(corridor_world, tmp_path):
@@ -101,7 +97,7 @@ def test_a_map_without_keyframes_is_refused(folder, short_flight):
 def test_the_command_prints_before_and_after_and_refuses_the_same_flight(
     folder, short_flight, tmp_path, capsys
 ):
-    before = _content(folder)
+    before = content(folder)
     settings = tmp_path / "settings.toml"
     settings.write_text("threads = 1\n[extend]\nmin_track = 3\n")
     words = [maps, "extend", folder, short_flight, "--rate-hz", RATE_HZ, "--settings", settings]
@@ -111,12 +107,12 @@ def test_the_command_prints_before_and_after_and_refuses_the_same_flight(
         assert f"{report[name][0]} -> {report[name][1]}" in printed
         assert report[name][1] > report[name][0]
     kept = tmp_path / "map.before"
-    assert _content(kept) == before and str(kept) in printed
+    assert content(kept) == before and str(kept) in printed
     assert len(store.load(folder).keyframes) == report["keyframes"][1]
-    after = _content(folder)
+    after = content(folder)
     with pytest.raises(MapError, match="the flight 'short' is in the map already"):
         run(*words)
-    assert _content(folder) == after
+    assert content(folder) == after
     with pytest.raises(MapError, match="is the map itself"):
         run(*words, "--out", folder)
     with pytest.raises(InputError, match="its folder does not exist"):
@@ -130,7 +126,7 @@ def test_stopped_at_any_moment_it_leaves_the_old_map(
     map_ = store.load(folder)
     map_.info.built["noise_px"] = 0.3
     store.save_tables(folder, map_)
-    before = _content(folder)
+    before = content(folder)
 
     losses = []
 
@@ -141,7 +137,7 @@ def test_stopped_at_any_moment_it_leaves_the_old_map(
     monkeypatch.setattr(extend if moment == "describe" else extend.store, moment, stop)
     with pytest.raises(KeyboardInterrupt):
         extend_map(folder, [short_flight], SETTINGS, rate_hz=RATE_HZ)
-    assert _content(folder) == before
+    assert content(folder) == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["map", "short"]
     # What is new is adjusted with a loss as wide as the noise that the map's build found.
     assert losses == ([0.3] if moment == "describe" else [])
@@ -150,7 +146,7 @@ def test_stopped_at_any_moment_it_leaves_the_old_map(
 def test_killed_while_it_writes_it_leaves_the_old_map(
     corridor_world, folder, short_flight, tmp_path
 ):
-    before = _content(folder)
+    before = content(folder)
     pictures = corridor_world.corridor.pictures[:9]
     arrays = {
         f"{name}{k}": getattr(picture, name)
@@ -183,7 +179,7 @@ def test_killed_while_it_writes_it_leaves_the_old_map(
         env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == -signal.SIGKILL, done.stderr
-    assert _content(folder) == before
+    assert content(folder) == before
     # What it left beside is in nobody's way.
     extend_map(folder, [short_flight], SETTINGS, rate_hz=RATE_HZ)
     assert len(store.load(folder).keyframes) > 25

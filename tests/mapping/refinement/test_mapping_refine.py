@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hand_made import content
 from refining import ROOT, SETTINGS, _along, _localized
 
 from ground_station.errors import MapError
@@ -186,25 +187,25 @@ def test_a_keyframe_and_landmarks_without_observations_are_no_hindrance(world):
 
 
 def test_the_old_map_is_kept_whole_and_other_files_stay(world):
-    old = {p.name: p.read_bytes() for p in world.folder.iterdir() if p.is_file()}
+    old = content(world.folder)
     _, result = refine_map(world.folder, [world.flight()], SETTINGS)
     assert result.kept == world.folder.with_name("room.before")
-    assert {p.name: p.read_bytes() for p in result.kept.iterdir() if p.is_file()} == old
-    assert len(store.load(result.kept).keyframes) == 8 and (result.kept / "sparse").is_dir()
+    assert content(result.kept) == old
+    assert len(store.load(result.kept).keyframes) == 8
     assert (world.folder / "floorplan.yaml").is_file()
 
 
 def test_a_new_folder_leaves_the_map_alone_and_has_its_floor_plan(world, tmp_path):
-    old = {p.name: p.read_bytes() for p in world.folder.iterdir() if p.is_file()}
+    old = content(world.folder)
     refined, result = refine_map(world.folder, [world.flight()], SETTINGS, tmp_path / "new")
     assert result.kept is None and refined.info.name == "new"
-    assert {p.name: p.read_bytes() for p in world.folder.iterdir() if p.is_file()} == old
+    assert content(world.folder) == old
     assert (tmp_path / "new" / "floorplan.yaml").is_file()
     assert len(store.load(tmp_path / "new").keyframes) == len(refined.keyframes)
 
 
 def test_ctrl_c_leaves_the_old_map_whole(world, monkeypatch):
-    old = {p.name: p.read_bytes() for p in world.folder.iterdir() if p.is_file()}
+    old = content(world.folder)
     calls = []
 
     def adjust(*_, **__):
@@ -216,7 +217,7 @@ def test_ctrl_c_leaves_the_old_map_whole(world, monkeypatch):
     monkeypatch.setattr(adjustment, "adjust", adjust)
     with pytest.raises(KeyboardInterrupt):
         refine_map(world.folder, [world.flight()], SETTINGS)
-    assert {p.name: p.read_bytes() for p in world.folder.iterdir() if p.is_file()} == old
+    assert content(world.folder) == old
     assert [p.name for p in world.folder.parent.iterdir()] == ["room"]
 
 
@@ -240,7 +241,7 @@ def test_a_map_is_there_whenever_the_program_is_killed(world, exchange, monkeypa
 
 def test_a_program_killed_while_it_adjusts_leaves_the_old_map(world, tmp_path):
     save_observations(tmp_path / "f.safetensors", world.flight())
-    old = {p.name: p.read_bytes() for p in world.folder.iterdir() if p.is_file()}
+    old = content(world.folder)
     script = (
         "import sys, time; from ground_station.mapping.refinement import refine\n"
         "def wait(*_): print('writing', flush=True); time.sleep(60)\n"
@@ -254,6 +255,6 @@ def test_a_program_killed_while_it_adjusts_leaves_the_old_map(world, tmp_path):
     assert process.stdout is not None and process.stdout.readline() == "writing\n"
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    assert {p.name: p.read_bytes() for p in world.folder.iterdir() if p.is_file()} == old
+    assert content(world.folder) == old
     refine_map(world.folder, [world.flight()], SETTINGS)  # what was left behind is no hindrance
     assert len(store.load(world.folder).keyframes) > 8
