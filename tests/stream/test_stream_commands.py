@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 
 from ground_station.cli import main
 from ground_station.keys.authority import Authority
 from ground_station.stream.command import ask
-from pi_firmware.wire import keys, messages
+from pi_firmware.wire import credentials, keys, messages
 from pi_firmware.wire.errors import TelemetryError
-from pi_firmware.wire.telemetry import Session, open_session
+from pi_firmware.wire.telemetry import Session, open_session, session_config
 
 LIMIT_S = 20.0
 
@@ -212,11 +213,17 @@ def test_over_tls_only_a_ground_on_the_list_is_answered(tmp_path: Path) -> None:
     other = open_session(connect=served.listening, certificates=made.of("payload.blimp-2"))
     with pytest.raises(TelemetryError, match="was not heard of"):
         ask(other, "blimp-1", "idr", timeout_s=1.5)
-    # `ask` sends nothing where nobody seems to take questions; a stranger's program need not wait.
+    # A stranger's program need not wait until somebody takes questions, nor deny itself anything.
+    held = credentials.load(made.of("payload.blimp-2"))
+    bare = session_config([], served.listening, held, rules={"enabled": False})
+    stranger = zenoh.open(bare)
     order = messages.encode(messages.Command(time_ns=1))
-    for _ in range(5):
-        list(other.zenoh.get(keys.command("blimp-1", "idr"), payload=order, timeout=1.0))
-        time.sleep(0.1)
+    limit_s = time.monotonic() + LIMIT_S
+    while not list(stranger.info.peers_zid()) and time.monotonic() < limit_s:
+        time.sleep(0.02)
+    assert list(stranger.info.peers_zid())
+    assert not list(stranger.get(keys.command("blimp-1", "idr"), payload=order, timeout=1.0))
     assert len(fake.asked) == 1
+    stranger.close()
     for session in (other, ground, served):
         session.close()
