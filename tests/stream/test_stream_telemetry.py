@@ -4,7 +4,8 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from itertools import islice
 from typing import Any
 
@@ -24,6 +25,7 @@ from pi_firmware.wire.errors import TelemetryError
 from pi_firmware.wire.telemetry import open_session, session_config
 
 LIMIT_S = 20.0
+Connect = Callable[..., Telemetry]
 
 
 def gate(sequence: int, **fields: Any) -> messages.Gate:
@@ -40,18 +42,30 @@ def listener() -> Iterator[TelemetryListener]:
         yield opened
 
 
-def payload(listener: TelemetryListener, payload_id: str = "blimp-1") -> Telemetry:
-    return Telemetry(payload_id, TelemetrySettings(connect=list(listener.endpoints)))
+@pytest.fixture
+def payload() -> Iterator[Connect]:
+    """Connects payloads, and closes them whatever a test ends with."""
+    with ExitStack() as opened:
+
+        def connect(listener: TelemetryListener, payload_id: str = "blimp-1") -> Telemetry:
+            settings = TelemetrySettings(connect=list(listener.endpoints))
+            telemetry = Telemetry(payload_id, settings)
+            opened.callback(telemetry.close)
+            return telemetry
+
+        yield connect
 
 
-def test_a_payload_lives_from_its_start_to_its_end(listener: TelemetryListener) -> None:
+def test_a_payload_lives_from_its_start_to_its_end(
+    listener: TelemetryListener, payload: Connect
+) -> None:
     telemetry = payload(listener)
     assert listener.wait("blimp-1", lambda state: state.alive, LIMIT_S)
     telemetry.close()
     assert listener.wait("blimp-1", lambda state: not state.alive, LIMIT_S)
 
 
-def test_payloads_are_told_apart(listener: TelemetryListener) -> None:
+def test_payloads_are_told_apart(listener: TelemetryListener, payload: Connect) -> None:
     one, two = payload(listener, "one"), payload(listener, "two")
     one.publish(messages.Battery(time_ns=1, voltage=3.5))
     two.publish(messages.Battery(time_ns=2, voltage=4.1))
@@ -60,11 +74,9 @@ def test_payloads_are_told_apart(listener: TelemetryListener) -> None:
         assert state is not None and state.battery is not None
         assert state.battery.voltage == voltage
     assert listener.payloads() == ["one", "two"]
-    one.close()
-    two.close()
 
 
-def test_a_new_start_counts_from_zero(listener: TelemetryListener) -> None:
+def test_a_new_start_counts_from_zero(listener: TelemetryListener, payload: Connect) -> None:
     telemetry = payload(listener)
     health = messages.Health(time_ns=4, uptime_s=2.5, wifi_signal_dBm=-61.0, late=["camera"])
     telemetry.publish(health)
@@ -75,7 +87,6 @@ def test_a_new_start_counts_from_zero(listener: TelemetryListener) -> None:
     assert listener.wait_for_event("blimp-1", messages.EVENT_STARTED, LIMIT_S)
     state = listener.state("blimp-1")
     assert state is not None and state.decisions == {} and state.frames is state.health is None
-    telemetry.close()
 
 
 def test_discarded_frames_are_counted_and_none_of_an_older_payload() -> None:
@@ -88,7 +99,9 @@ def test_discarded_frames_are_counted_and_none_of_an_older_payload() -> None:
     assert state.frames == FrameCounts(11, 2, 1, 5, discarded=0)
 
 
-def test_decisions_are_kept_by_frame_and_the_newest_counts(listener: TelemetryListener) -> None:
+def test_decisions_are_kept_by_frame_and_the_newest_counts(
+    listener: TelemetryListener, payload: Connect
+) -> None:
     telemetry = payload(listener)
     for sequence in range(50):
         telemetry.publish(gate(sequence, gated=sequence // 10))
@@ -96,11 +109,10 @@ def test_decisions_are_kept_by_frame_and_the_newest_counts(listener: TelemetryLi
     assert state is not None
     assert state.frames == FrameCounts(captured=50, gated=4, heartbeats=0, sent=49)
     assert state.ssrc == 9
-    telemetry.close()
 
 
 def test_the_last_event_arrives_although_the_payload_ends_at_once(
-    listener: TelemetryListener,
+    listener: TelemetryListener, payload: Connect
 ) -> None:
     for number in range(8):
         telemetry = payload(listener, f"p{number}")
@@ -162,7 +174,7 @@ def test_clocks_of_those_that_are_gone_are_let_go(monkeypatch: pytest.MonkeyPatc
         alone.close()
 
 
-def test_messages_are_handed_on_as_they_come() -> None:
+def test_messages_are_handed_on_as_they_come(payload: Connect) -> None:
     heard: list[tuple[str, str, messages.Message]] = []
     with TelemetryListener(
         ["tcp/127.0.0.1:0"],
@@ -172,7 +184,6 @@ def test_messages_are_handed_on_as_they_come() -> None:
         event = messages.Event(time_ns=1, name="hello", text="")
         telemetry.publish(event)
         assert listener.wait_for_event("blimp-1", "hello", LIMIT_S)
-        telemetry.close()
     assert heard == [("blimp-1", "event", event)]
 
 
@@ -183,13 +194,14 @@ def test_an_endpoint_in_use_is_one_line(listener: TelemetryListener) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_two_listeners_on_free_ports_do_not_meet(listener: TelemetryListener) -> None:
+def test_two_listeners_on_free_ports_do_not_meet(
+    listener: TelemetryListener, payload: Connect
+) -> None:
     with TelemetryListener(["tcp/127.0.0.1:0"]) as other:
         assert other.endpoints != listener.endpoints
-        telemetry = payload(listener)
+        payload(listener)
         assert listener.wait("blimp-1", lambda state: state.alive, LIMIT_S)
         assert other.payloads() == []
-        telemetry.close()
 
 
 def test_a_payload_that_starts_first_is_found_when_the_listener_comes() -> None:
