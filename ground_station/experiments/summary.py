@@ -258,8 +258,8 @@ def judge_claims(
 ) -> list[dict[str, Any]]:
     """Each claim with its figure, as plain values; `kept` is None where no run tells.
 
-    A figure that runs should have and some have not, as the time of a recovery that never came,
-    keeps nothing. Claims of experiments that were not wanted are left out.
+    A run without the figure, whose recovery never came or for which no map could be made, is worse
+    than any that has it. Claims of experiments that were not wanted are left out.
     """
     cases = {f"{e['name']}.{c['name']}": [c] for e in experiments for c in e["cases"]}
     cases |= {e["name"]: e["cases"] for e in experiments}
@@ -273,7 +273,7 @@ def judge_claims(
         value = values[0]
         if value is not None and claim.against:
             value = value / values[1] if values[1] else None
-        measured = all(of and not any("failed" in run for run in of) for of in runs)
+        measured = all(of and not any(run.get("accident") for run in of) for of in runs)
         kept = value is not None and _within(value, claim) if measured else None
         unit = " times" if claim.against else _UNITS[claim.figure.rpartition("_")[2]]
         found.append({"text": claim.text, "value": value, "most": claim.most, "least": claim.least,
@@ -297,11 +297,12 @@ def _runs(case: dict[str, Any], claim: Claim) -> list[dict[str, Any]]:
 
 
 def _value(runs: Sequence[dict[str, Any]], claim: Claim) -> float | None:
-    """None where a run has no such figure."""
-    numbers = [run.get(claim.figure) for run in runs]
-    if not numbers or None in numbers:
-        return None
-    return float(_OVER_RUNS[claim.statistic](numbers))
+    """None where a run that has no such figure decides it."""
+    worst = math.inf if claim.least is None else -math.inf
+    numbers = [worst if (v := run.get(claim.figure)) is None else v for run in runs]
+    with np.errstate(invalid="ignore"):
+        value = float(_OVER_RUNS[claim.statistic](numbers)) if numbers else math.nan
+    return value if math.isfinite(value) else None
 
 
 def _within(value: float, claim: Claim) -> bool:

@@ -73,8 +73,16 @@ def test_a_claim_of_an_experiment_is_of_all_its_runs(tmp_path, claim, kept, valu
     found = document(tmp_path, f"{POSITION}\n{claim}", [kept_runs.run(SUNSET)] * 2, noon)
     one = found["claims"][1]
     assert one["kept"] is kept and one["value"] == pytest.approx(value)
-    found = document(tmp_path, f"{POSITION}\n{claim}", [kept_runs.run(SUNSET), {"failed": "no"}])
-    assert found["claims"][1]["kept"] is None
+
+
+def test_a_run_without_a_map_is_worse_than_any_with_one(tmp_path):
+    runs = [kept_runs.run(SUNSET), {"failed": "no two images overlap"}]
+    for statistic, kept, value in (("median", True, 0.02), ("p95", False, None)):
+        claim = f'[claim.all]\ntext = "All"\nrow = "light"\nstatistic = "{statistic}"\n{POSITION}'
+        one = document(tmp_path, f"{POSITION}\n{claim}", runs)["claims"][1]
+        assert one["kept"] is kept and one["value"] == (value and pytest.approx(value))
+    (one,) = document(tmp_path, RATIO, [kept_runs.run(NOON)] * 2, noon=runs)["claims"]
+    assert one["kept"] is False  # nothing is small beside what was not found
 
 
 def test_a_recovery_that_never_came_keeps_nothing(tmp_path):
@@ -88,7 +96,7 @@ def test_a_recovery_that_never_came_keeps_nothing(tmp_path):
 
 
 def test_what_was_not_measured_is_neither_kept_nor_broken(tmp_path):
-    good, failed = kept_runs.run(NOON), {"failed": "no two images overlap"}
+    good, failed = kept_runs.run(NOON), {"failed": "killed", "accident": True}
     (one,) = document(tmp_path, POSITION, [good, failed])["claims"]
     assert one["kept"] is None and summary.claim_line(one).endswith("not measured.")
     (one,) = document(tmp_path, RATIO, [good, good], noon=[failed, good])["claims"]
