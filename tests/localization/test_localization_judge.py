@@ -45,8 +45,8 @@ def test_a_good_frame_is_tracking_and_gives_no_reason(judge):
         ({"observations": 500}, "few agree: 200 of 500"),
         ({"spread": 0.01}, "poor spread: 0.010"),
         ({"residual_px": 9.0}, "high residual: 9.0 px"),
-        ({"covariance": np.diag([1e-6] * 3 + [0.1] * 3)}, "uncertain position: 0.55 m"),
-        ({"covariance": np.diag([1e-2] * 3 + [1e-4] * 3)}, "uncertain direction: 9.9 deg"),
+        ({"covariance": np.diag([1e-6] * 3 + [0.006] * 3)}, "uncertain position: 0.13 m"),
+        ({"covariance": np.diag([3e-4] * 3 + [1e-4] * 3)}, "uncertain direction: 1.7 deg"),
         ({"covariance": np.full((6, 6), np.nan)}, "uncertain position: nan m"),
         ({"innovation": 400.0}, "jump: 20.0 sigma from the prediction"),
         (
