@@ -158,10 +158,9 @@ class Acquirer:
         other = far.solution.state
         if other is None or not sweeping.opens(state.covariance, other.covariance, near):
             return found
-        least = self._settings.recovery.min_significance
         support = self.matcher.support(seen, state.wTc, near)
         # Each landmark adds one deviation at most: of too few nothing can be told.
-        if support.significance >= least or support.expected < least:
+        if support.significance >= sweeping.SURE or support.expected < sweeping.SURE:
             return found
         step = sweeping.weakest(other.covariance[:6, :6], median)
         moved_px = float(self.matcher.camera.fx_px * np.linalg.norm(step[3:]) / near)
@@ -175,7 +174,7 @@ class Acquirer:
             again = self._locate_once(seen, around, expected, estimator, _FOUND_RADIUS_PX, watch)
             if again.solution.state is not None:
                 sure = self.matcher.support(seen, again.solution.state.wTc, near).significance
-                if sure >= least and sure > most:
+                if sure >= sweeping.SURE and sure > most:
                     best, most = again, sure
         return best
 

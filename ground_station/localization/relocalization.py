@@ -139,9 +139,6 @@ _NEIGHBOURS = 12
 """Keyframes that saw most of a found pose's inliers: what they saw should be seen."""
 _MIN_MATCHED = 12
 """Inliers of RANSAC that are worth the check that follows."""
-_WEAK = 6.0
-"""Deviations by which a find must show more landmarks than chance to count beside a prediction, as
-of a keyframe that is followed."""
 _MAX_SIGMA = 0.005
 """Of the position, from the inliers alone, over their depth: beyond, a rolling shutter's shear
 moves it far. Right finds of an atrium, a kitchen and a corridor had 0.003 at most."""
@@ -196,13 +193,13 @@ class _Search:
         beyond, doubt = support.share - support.chance, ""
         if len(feature) < settings.min_inliers:
             doubt = f"{len(feature)} of {support.expected} landmarks where they should be"
-        elif beyond < settings.min_excess or support.significance < settings.min_significance:
+        elif beyond < settings.min_excess or support.evenness < settings.min_evenness:
             doubt = (
                 f"{support.share:.0%} of {support.expected} landmarks found, "
                 f"{support.chance:.0%} by chance"
             )
-        if doubt and (len(feature) < _MIN_MATCHED or support.significance < _WEAK):
-            return doubt
+        if len(feature) < _MIN_MATCHED or support.significance < settings.min_significance:
+            return doubt or f"{support.significance:.1f} sigma more landmarks than by chance"
         if spread(self.seen.features.keypoints_px[feature], self.camera) < settings.min_spread:
             return "the inliers lie in one corner of the image"
         wTc = self._refine(wTc, feature, landmark)

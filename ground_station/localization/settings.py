@@ -176,7 +176,8 @@ class RecoverySettings:
     min_inliers: int = config.key(25, low=6, high=1000)
     min_inlier_share: float = config.key(0.25, low=0, high=1)
     min_excess: float = config.key(0.04, low=0, high=1)
-    min_significance: float = config.key(9.0, low=0, high=1000)
+    min_significance: float = config.key(6.0, low=0, high=1000)
+    min_evenness: float = config.key(3.5, low=0, high=1000)
     min_spread: float = config.key(0.06, low=0, high=0.5)
 
 

@@ -16,6 +16,8 @@ NEAR, FAR = 0.5, 0.8
 """Of the median depth: nearer landmarks tell a turn from a step aside, farther ones do not."""
 MORE = 2.0
 """Deviations of a count by which another pose must show more near landmarks."""
+SURE = 10.0
+"""Deviations by which more near landmarks are seen than by chance where they hold a pose."""
 TRIED = 3
 """Poses, those with the most near landmarks, that are solved."""
 _OPENS, _OPEN = 3.0, 0.01

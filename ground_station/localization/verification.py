@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from ground_station.arrays import F32, F64, Indices
@@ -28,6 +29,8 @@ APART = 1.2
 """
 _SHIFTS = np.array([[4.8, 2.0], [-4.8, -2.0], [-2.0, 4.8], [2.0, -4.8]])
 """In radii: where the landmarks are certainly not: what matches there matches by chance."""
+_CELLS = 16
+"""In the picture's width. What is seen of one thing, a door like many, fills a few."""
 _CONES = ProjectionSettings(viewing_cone=True)
 
 
@@ -42,7 +45,10 @@ class Support:
 
     `feature` and `landmark` (N,): landmarks found again near where they project, each once;
     `expected`: landmarks that should be visible; `share` of them found; `chance`: the share found
-    when the projections are shifted aside, which a wrong pose reaches as well.
+    when the projections are shifted aside, which a wrong pose reaches as well. `evenness`:
+    Student's t of the share beyond chance over cells of the picture, each counted once, as what is
+    found in one cell is no independent sample (cluster-robust tests do so: Liang and Zeger,
+    Biometrika 1986).
     """
 
     feature: Indices
@@ -50,6 +56,7 @@ class Support:
     expected: int
     share: float
     chance: float
+    evenness: float = 0.0
 
     @property
     def significance(self) -> float:
@@ -67,7 +74,7 @@ class Witness:
     ) -> None:
         """`modes` of the map's landmarks; `scale` of descriptor distances, over RootSIFT's."""
         self.features, self.camera, self._modes = features, camera, modes
-        self._radius_px = near_px(camera)
+        self._radius_px, self._width_px = near_px(camera), camera.width_px
         self._farthest = min(_MAX_DISTANCE * scale, max(_MAX_DISTANCE, APART))
         self._tree = cKDTree(features.keypoints_px)
 
@@ -89,7 +96,10 @@ class Witness:
         rows = np.flatnonzero(found)
         rows = rows[np.argsort(distance[rows], kind="stable")]
         rows = rows[np.unique(feature[rows], return_index=True)[1]]
-        return Support(feature[rows], index[rows], len(index), float(found.mean()), float(chance))
+        evenness = _evenness(pixel // (self._width_px / _CELLS), found, float(chance))
+        return Support(
+            feature[rows], index[rows], len(index), float(found.mean()), float(chance), evenness
+        )
 
     def count(self, wTc: F64, landmarks: Landmarks, index: Indices) -> int:
         """How many of the landmarks `index` (M,) are found, by chance or not."""
@@ -124,3 +134,15 @@ class Witness:
             nearest = order[np.searchsorted(pixel[order], np.arange(len(pixel_px)))]
             feature, distance = feature[nearest], distance[nearest]
         return feature, np.asarray(distance, np.float64)
+
+
+def _evenness(cell: F64, found: npt.NDArray[np.bool_], chance: float) -> float:
+    """Of landmarks in cells (N, 2), some of them found; one cell alone tells nothing."""
+    _, of, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    cells = len(count)
+    if cells < 2:
+        return 0.0
+    excess = np.bincount(of.ravel(), found) / count - chance
+    # One cell more, all by chance, so that equal cells are not taken for certainty.
+    deviation = np.sqrt(((excess - excess.mean()) ** 2).sum() * cells / (cells - 1) + 1)
+    return float(excess.sum() / deviation)

@@ -122,6 +122,32 @@ def test_one_known_poster_in_another_building_is_no_place(building):
         assert isinstance(find(building.map, replace(features, descriptors=descriptors)), str)
 
 
+def test_what_is_seen_of_one_thing_says_less_than_as_much_all_over_the_picture(building):
+    """A door like many fills a few cells of the picture, and its landmarks come together."""
+    camera = replace(THESIS_CAMERA, readout_s=0.0)  # nothing is refused as open
+    # Of landmarks as sparse as these few fill a cell: fewer must do, and nothing else refuses them.
+    judging = replace(SETTINGS, min_inliers=15, min_spread=0.0, min_excess=0.02)
+    believing = replace(judging, min_evenness=0.0)
+    for wTc in building.path[[0, 3]]:
+        features = building.features(wTc, outliers=0.0)
+        aside = np.linalg.norm(features.keypoints_px - [320, 240], axis=1)
+        nearest, anywhere = np.argsort(aside), np.random.default_rng(6).permutation(len(aside))
+        for known, count, settings, is_found in (
+            (nearest, 28, judging, False),
+            (nearest, 28, believing, True),
+            (anywhere, 28, judging, True),
+            (nearest, 200, judging, True),
+        ):
+            descriptors = strangers(features.descriptors, np.random.default_rng(5))
+            kept = known[:count]
+            descriptors[kept] = features.descriptors[kept]
+            partly = replace(features, descriptors=descriptors)
+            relocalizer = Relocalizer(building.map, camera, settings, 0)
+            found = relocalizer.candidates(describe(partly, camera, Conditions()))
+            assert not isinstance(found, str), found
+            assert isinstance(relocalizer.alone(found), Relocalization) == is_found
+
+
 def test_of_two_equal_places_neither_is_believed(building):
     double = twice(building.map, 20.0)
     for wTc in building.path[:4]:
