@@ -30,6 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--features", nargs="+", metavar="NAME",
         help="extractors or models for the maps (default: as each row says)")  # fmt: skip
     add("--jobs", type=int, default=0, metavar="N", help="side by side (0: one a core)")
+    add("--dask", metavar="ADDRESS",
+        help="tcp://HOST:PORT, tls://HOST:PORT: by a cluster whose workers share --out and --data"
+    )  # fmt: skip
     add("--data", type=Path, default=Path("../shared/data"), metavar="DIR",
         help="folder of real video, redkitchen/ (../shared/data)")  # fmt: skip
     add("--sample", type=Path, default=Path("maps/atrium"), metavar="DIR",
@@ -62,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
     )
     from ground_station.experiments.store import Store
     from ground_station.files import write_json
+    from ground_station.mapping.construction.dask_option import parse_cluster
     from ground_station.mapping.settings import load_settings
 
     check_options(args, jobs=(0, 256))
@@ -86,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
     # come out otherwise then; the cores are busy with other jobs anyway.
     mapping = replace(mapping, threads=1)
     store = Store(args.out)
-    jobs = args.jobs or machine()["cores"]
+    jobs = parse_cluster(args.dask) if args.dask else args.jobs or machine()["cores"]
     planned = plan.make(declared, mapping, args.data)
     schedule.carry_out(planned, store, args.data, jobs)
     about = {"machine": machine(), "jobs": jobs, "quick": args.quick}

@@ -1,46 +1,23 @@
-"""Jobs over the cores, each after what it needs; stopped at any moment, the next start goes on."""
+"""Jobs over a Dask cluster, each after what it needs; stopped at any moment, the next start goes
+on."""
 
 from __future__ import annotations
 
-import contextlib
-import multiprocessing
-import os
 import shutil
-import signal
-import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from ground_station.calibration.errors import CalibrationError
-from ground_station.errors import GroundStationError, MapError
+from ground_station.errors import GroundStationError, InputError, MapError
 from ground_station.experiments.plan import FlightJob, Job, LensJob, MapJob, Plan, RunJob
 from ground_station.experiments.store import Store
+from ground_station.mapping.settings import MappingSettings
 from ground_station.progress import Progress
 from pi_firmware.wire.errors import BlimpError
 
 _TRIES = 2
-"""A process that ends takes its neighbours' pool with it: each gets a second try, alone."""
-
-
-def prepare() -> None:
-    """Makes a process a worker: one thread, Ctrl-C is the schedule's to see to, and none outlives
-    it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    import cv2
-
-    cv2.setNumThreads(1)
-
-
-def _end_with_parent() -> None:
-    """A pool that is killed leaves its workers waiting for jobs, each with a map in memory."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+"""A job gets a second process where its first ended under it."""
 
 
 def work(job: Job, folder: Path, data: Path) -> None:
@@ -49,6 +26,9 @@ def work(job: Job, folder: Path, data: Path) -> None:
     A film that does not determine its camera is a result, kept with its reason; so is a map that
     cannot be built, and what is left without them.
     """
+    import cv2
+
+    cv2.setNumThreads(1)  # the other cores have jobs of their own
     store = Store(folder)
     try:
         if isinstance(job, MapJob):
@@ -110,36 +90,67 @@ def _lens(job: MapJob | RunJob, store: Store) -> Path | None:
 Work = Callable[[Job, Path, Path], None]
 
 
-def carry_out(plan: Plan, store: Store, data: Path, jobs: int, do: Work = work) -> int:
-    """Does what is not there yet, `jobs` at a time, each by `do`; the number of jobs done.
+def carry_out(plan: Plan, store: Store, data: Path, where: str | int, do: Work = work) -> int:
+    """Does what is not there yet, each job by `do`; the number of jobs done.
 
-    Raises the first error that a person can fix, after the others in hand are finished; what was
-    done is kept. A job that its process did not survive, or that a defect of the program ended, is
-    kept as failed.
+    `where`: at the address of a cluster whose workers see the store's folder and the data, or in so
+    many processes here. Raises the first error that a person can fix, after the others in hand are
+    finished; what was done is kept. A job that its process did not survive, or that a defect of the
+    program ended, is kept as failed.
     """
     open_ = {key: job for key, job in plan.jobs.items() if not store.done(job)}
     _spread_failures(plan, store, open_)
-    done, tries = 0, dict.fromkeys(open_, 0)
-    with Progress("experiments, jobs", len(open_)) as progress:
-        while open_:
-            with _pool(jobs) as pool:
-                done += _until_broken(plan, store, data, jobs, do, pool, open_, tries, progress)
-    return done
+    if not open_:
+        return 0
+    # Imported only when there is work: it takes a second.
+    import dask
+    import distributed  # noqa: F401 -- whose configuration is set
+
+    from ground_station.mapping.construction.cluster import CANCELLED, client_of
+
+    of_cluster = {
+        "distributed.scheduler.allowed-failures": _TRIES - 1,
+        "distributed.scheduler.worker-ttl": None,  # a job may hold its process for minutes
+    }
+    with (
+        dask.config.set(of_cluster),
+        client_of(where, MappingSettings()) as client,
+        client.as_current(),
+        Progress("experiments, jobs", len(open_)) as progress,
+    ):
+        if isinstance(where, str):
+            store.folder.mkdir(parents=True, exist_ok=True)
+            for folder in filter(Path.is_dir, (store.folder, data)):
+                _check_shared(client, folder.resolve())
+        try:
+            return _until_done(plan, store, data, do, client, open_, progress)
+        except CANCELLED:
+            raise GroundStationError(
+                "the cluster is gone; what was done is kept: start again to go on"
+            ) from None
 
 
-def _until_broken(
+def _check_shared(client: Any, folder: Path) -> None:
+    for address, there in client.run(folder.is_dir).items():
+        if not there:
+            raise InputError(
+                f"the worker {address} has no folder {folder}: flights, maps and runs are files; "
+                "give --out and --data in folders that all workers share"
+            )
+
+
+def _until_done(
     plan: Plan,
     store: Store,
     data: Path,
-    jobs: int,
     do: Work,
-    pool: ProcessPoolExecutor,
+    client: Any,
     open_: dict[str, Job],
-    tries: dict[str, int],
     progress: Progress,
 ) -> int:
-    """Works until all is done, or until a process dies and with it the pool."""
-    running: dict[Future[None], str] = {}
+    from distributed import KilledWorker, wait
+
+    running: dict[Any, str] = {}
     done = 0
     error: BlimpError | None = None
     while open_ and not (error and not running):
@@ -149,23 +160,16 @@ def _until_broken(
             for key in open_
             if key not in busy and not any(need in open_ for need in plan.needs[key])
         ]
-        chosen = ready[: jobs - len(running)]
-        second = [key for key in ready if tries[key]]
-        if second or any(tries[key] == _TRIES for key in busy):
-            chosen = [] if running else second[:1]
-        for key in [] if error else chosen:
-            tries[key] += 1
-            running[pool.submit(do, open_[key], store.folder, data)] = key
-        finished, _ = wait(running, return_when=FIRST_COMPLETED)
-        broken = False
-        for future in finished:
+        # No more than are worked on at a time, so that none waits beside one that ends its process.
+        free = max(1, sum(client.nthreads().values())) - len(running)
+        for key in [] if error else ready[: max(0, free)]:
+            args = open_[key], store.folder.resolve(), data.resolve()
+            running[client.submit(do, *args, pure=False)] = key
+        for future in wait(list(running), return_when="FIRST_COMPLETED").done:
             key = running.pop(future)
             try:
                 future.result()
-            except BrokenProcessPool:
-                broken = True
-                if tries[key] < _TRIES:
-                    continue
+            except KilledWorker:
                 _fail(store, open_[key], f"its process ended {_TRIES} times")
             except BlimpError as caught:
                 error = error or caught
@@ -176,8 +180,6 @@ def _until_broken(
             done += 1
             progress.step()
             _spread_failures(plan, store, open_)
-        if broken:
-            return done
     if error:
         raise error
     return done
@@ -198,18 +200,3 @@ def _spread_failures(plan: Plan, store: Store, open_: dict[str, Job]) -> None:
                 store.write(key, failure)
                 del open_[key]
                 break
-
-
-@contextlib.contextmanager
-def _pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """Fresh processes; on an error or Ctrl-C they are ended at once: all they do is kept whole."""
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, context, prepare)
-    try:
-        yield pool
-    except BaseException:
-        for process in list(getattr(pool, "_processes", {}).values()):
-            process.terminate()
-        pool.shutdown(wait=True, cancel_futures=True)
-        raise
-    pool.shutdown(wait=True, cancel_futures=True)

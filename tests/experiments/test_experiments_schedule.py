@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import signal
+import threading
 import time
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import dask
+import distributed
 import pytest
 
-from ground_station.errors import InputError
+from ground_station.errors import GroundStationError, InputError
 from ground_station.experiments import schedule
 from ground_station.experiments.declaration import Alteration, FlightDeclaration, MapSpec
 from ground_station.experiments.plan import FlightJob, LensJob, MapJob, Plan, RunJob
@@ -23,11 +29,10 @@ from tests.waiting import eventually
 
 
 @pytest.fixture(autouse=True)
-def imported_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def imported_once() -> Iterator[None]:
     """Workers are forks of a process that has imported the program: each would take a second."""
-    server = multiprocessing.get_context("forkserver")
-    server.set_forkserver_preload([schedule.__name__, "cv2"])
-    monkeypatch.setattr(schedule.multiprocessing, "get_context", lambda _: server)
+    with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        yield
 
 
 def a_plan(runs=3):
@@ -167,8 +172,6 @@ def test_a_defect_of_the_program_costs_its_own_job_and_is_an_accident(tmp_path):
 
 
 def test_an_interrupt_ends_the_workers_and_keeps_what_was_done(tmp_path):
-    import threading
-
     def interrupt() -> None:
         limit = time.monotonic() + 30
         while not list(tmp_path.glob("begun-*")) and time.monotonic() < limit:
@@ -187,6 +190,44 @@ def test_an_interrupt_ends_the_workers_and_keeps_what_was_done(tmp_path):
     finally:
         signal.signal(signal.SIGINT, before)
     assert done(tmp_path) == ["f", "m"]
+
+
+@pytest.fixture
+def cluster() -> Iterator[distributed.LocalCluster]:
+    """Somebody's own, of one process."""
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0",
+        worker_dashboard_address="127.0.0.1:0", silence_logs=logging.CRITICAL,
+    ) as cluster:  # fmt: skip
+        yield cluster
+
+
+def test_a_cluster_does_them_too_and_one_that_goes_costs_nothing_that_was_done(tmp_path, cluster):
+    plan = a_plan()
+    assert carry_out(a_plan(), Store(tmp_path), tmp_path, cluster.scheduler_address, note) == 5
+    plan.jobs["r3"] = replace(plan.jobs["r0"], key="r3")
+    plan.needs["r3"] = ("m", "f")
+
+    def leave() -> None:
+        eventually((tmp_path / "begun-r3").is_file, what="the run")
+        cluster.close()
+
+    thread = threading.Thread(target=leave)
+    thread.start()
+    with pytest.raises(GroundStationError, match="the cluster is gone"):
+        carry_out(plan, Store(tmp_path), tmp_path, cluster.scheduler_address, slow)
+    thread.join()
+    assert sorted(done(tmp_path)) == ["f", "m", "r0", "r1", "r2"]
+
+
+def test_workers_that_see_other_folders_are_refused_by_name(tmp_path):
+    class Client:
+        def run(self, function):
+            assert function()
+            return {"tcp://a:1": True, "tcp://b:1": False}
+
+    with pytest.raises(InputError, match=r"worker tcp://b:1 has no folder .*workers share"):
+        schedule._check_shared(Client(), tmp_path)
 
 
 def linger(job, folder: Path, data: Path) -> None:

@@ -50,7 +50,7 @@ _PAIRS = 16
 _LARGE_BYTES = 65_536
 """An array larger than this, such as a picture, goes to a worker by itself: Dask's scheduler keeps
 the arguments of every call."""
-_CANCELLED = (asyncio.CancelledError, concurrent.futures.CancelledError)
+CANCELLED = (asyncio.CancelledError, concurrent.futures.CancelledError)
 
 Versions = dict[str, str]
 
@@ -178,7 +178,7 @@ class Cluster:
         while True:
             try:
                 return call.future.result(timeout=_LOOK_S)
-            except _CANCELLED as error:
+            except CANCELLED as error:
                 self._again(call, _line(error))
             except TimeoutError:
                 if any(future.status == "lost" for future in _futures(call)):
@@ -214,13 +214,24 @@ def _futures(call: _Call) -> list[Any]:
 
 @contextmanager
 def connected(where: str | int, settings: MappingSettings) -> Iterator[Cluster]:
-    """The cluster at an address, or of so many processes on this machine, until the block ends.
+    """The workers of `client_of`, until the block ends."""
+    with client_of(where, settings) as client:
+        yield Cluster(client, _place(where), settings, here=not isinstance(where, str))
+
+
+def _place(where: str | int) -> str:
+    return where if isinstance(where, str) else "Dask on this machine"
+
+
+@contextmanager
+def client_of(where: str | int, settings: MappingSettings) -> Iterator[Any]:
+    """A client of the cluster at an address, or of so many processes on this machine.
 
     Raises `MapError` where nobody answers, there is no worker, or one of them differs.
     """
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said in one line
     with ExitStack() as held:
-        place = where if isinstance(where, str) else "Dask on this machine"
+        place = _place(where)
         try:
             client = held.enter_context(_client(where, held))
         except (OSError, TimeoutError, TypeError, ValueError, RuntimeError) as error:
@@ -230,7 +241,7 @@ def connected(where: str | int, settings: MappingSettings) -> Iterator[Cluster]:
         except TimeoutError:
             raise MapError(f"{place}: the scheduler has no workers") from None
         _check_workers(client, place, settings)
-        yield Cluster(client, place, settings, here=not isinstance(where, str))
+        yield client
 
 
 def _client(where: str | int, held: ExitStack) -> Any:
