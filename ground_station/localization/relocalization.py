@@ -135,6 +135,8 @@ def pose_from_matches(
 
 _RETRIEVED, _PLACES, _MIN_SHARED = 24, 3, 0.15
 """Keyframes retrieved, places tried, the share of landmarks that makes keyframes one place."""
+_WIDE = 30_000
+"""Landmarks that are searched at last, those of the most alike keyframes: a tenth of a second."""
 _NEIGHBOURS = 12
 """Keyframes that saw most of a found pose's inliers: what they saw should be seen."""
 _MIN_MATCHED = 12
@@ -255,15 +257,17 @@ class Relocalizer:
         Those with a doubt are to be believed only where something else says the same.
 
         The most alike keyframes are matched together, so that only what is unlike all the rest
-        counts, and when that fails (in a building that repeats itself) place by place. A map
-        without keyframes is one place. The same frame gives the same answer.
+        counts, and when that fails (in a building that repeats itself) place by place, and then as
+        much of the map as can be searched at once: in other light the most alike may all be wrong.
+        A map without keyframes is one place. The same frame gives the same answer.
         """
         if not len(seen):
             return "no features"
         search = _Search(seen, self._map, self._camera, self._settings, self._seed, self._scale)
         if self._index is None:
             return _only_place(search)
-        ranked = self._index.ranked(seen.features.descriptors, _RETRIEVED)
+        alike = self._index.ranked(seen.features.descriptors)
+        ranked = alike[:_RETRIEVED]
         together = self._try(self._index, search, self._index.seen_by(ranked))
         found = []
         if not isinstance(together, str):
@@ -274,6 +278,10 @@ class Relocalizer:
             alone = self._try(self._index, search, self._index.seen_by(place))
             if not isinstance(alone, str):
                 found.append(alone)
+        if all(one.doubt for one in found):
+            wide = self._try(self._index, search, self._index.first_seen(alike, _WIDE))
+            if not isinstance(wide, str):
+                found.append(wide)
         return found or f"{together} in the most alike places"
 
     def alone(self, found: list[Relocalization]) -> Relocalization | str:

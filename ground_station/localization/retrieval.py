@@ -108,6 +108,13 @@ class PlaceIndex:
         seen = [landmark[offset[k] : offset[k + 1]] for k in np.atleast_1d(keyframes).tolist()]
         return np.unique(np.concatenate(seen)).astype(np.intp) if seen else np.empty(0, np.intp)
 
+    def first_seen(self, keyframes: Indices, most: int) -> Indices:
+        """The first `most` landmarks that some keyframes observed, one keyframe after the other."""
+        offset, landmark = self._keyframes.offset, self._keyframes.landmark
+        seen = np.concatenate([landmark[offset[k] : offset[k + 1]] for k in keyframes.tolist()])
+        _, first = np.unique(seen, return_index=True)
+        return np.sort(seen[np.sort(first)[:most]]).astype(np.intp)
+
     def seeing(self, landmarks: Indices, most: int) -> Indices:
         """The keyframes that observed most of some landmarks (N,), best first; none without any."""
         wanted = np.zeros(self._seen.shape[1], np.float32)
@@ -152,7 +159,7 @@ class PlaceIndex:
                 cosine[placed, 1] = value[second & ~first]
         return best, cosine
 
-    def ranked(self, descriptors: F32, most: int) -> Indices:
+    def ranked(self, descriptors: F32, most: int | None = None) -> Indices:
         """The keyframes most like a frame with unit descriptors (N, D), best first."""
         landmark, cosine = self.nearest(descriptors)
         distance = np.sqrt(np.maximum(2 - 2 * cosine, 0))

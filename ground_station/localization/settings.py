@@ -177,7 +177,7 @@ class RecoverySettings:
     min_inlier_share: float = config.key(0.25, low=0, high=1)
     min_excess: float = config.key(0.04, low=0, high=1)
     min_significance: float = config.key(6.0, low=0, high=1000)
-    min_evenness: float = config.key(3.5, low=0, high=1000)
+    min_evenness: float = config.key(4.0, low=0, high=1000)
     min_spread: float = config.key(0.06, low=0, high=0.5)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from ground_station.arrays import F32, F64, Indices
@@ -88,18 +87,18 @@ class Witness:
         found = distance < self._farthest
         chance = np.mean(
             [
-                (self._near(pixel + s, descriptors, mode)[1] < self._farthest).mean()
+                self._near(pixel + s, descriptors, mode)[1] < self._farthest
                 for s in _SHIFTS * self._radius_px
-            ]
+            ],
+            axis=0,
         )
         # A feature is one landmark: the one it looks most like.
         rows = np.flatnonzero(found)
         rows = rows[np.argsort(distance[rows], kind="stable")]
         rows = rows[np.unique(feature[rows], return_index=True)[1]]
-        evenness = _evenness(pixel // (self._width_px / _CELLS), found, float(chance))
-        return Support(
-            feature[rows], index[rows], len(index), float(found.mean()), float(chance), evenness
-        )
+        evenness = _evenness(pixel // (self._width_px / _CELLS), found - chance)
+        share, by_chance = float(found.mean()), float(chance.mean())
+        return Support(feature[rows], index[rows], len(index), share, by_chance, evenness)
 
     def count(self, wTc: F64, landmarks: Landmarks, index: Indices) -> int:
         """How many of the landmarks `index` (M,) are found, by chance or not."""
@@ -136,13 +135,13 @@ class Witness:
         return feature, np.asarray(distance, np.float64)
 
 
-def _evenness(cell: F64, found: npt.NDArray[np.bool_], chance: float) -> float:
-    """Of landmarks in cells (N, 2), some of them found; one cell alone tells nothing."""
+def _evenness(cell: F64, beyond: F64) -> float:
+    """Of landmarks in cells (N, 2), each found beyond chance (N,); one cell alone tells nothing."""
     _, of, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     cells = len(count)
     if cells < 2:
         return 0.0
-    excess = np.bincount(of.ravel(), found) / count - chance
+    excess = np.bincount(of.ravel(), beyond) / count
     # One cell more, all by chance, so that equal cells are not taken for certainty.
     deviation = np.sqrt(((excess - excess.mean()) ** 2).sum() * cells / (cells - 1) + 1)
     return float(excess.sum() / deviation)

@@ -12,6 +12,7 @@ from synthetic import apart, keyframes_of, unit_rows
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.geometry.camera import THESIS_CAMERA
+from ground_station.localization import relocalization
 from ground_station.localization.attempt import Conditions
 from ground_station.localization.matching import describe
 from ground_station.localization.relocalization import (
@@ -133,9 +134,9 @@ def test_what_is_seen_of_one_thing_says_less_than_as_much_all_over_the_picture(b
         aside = np.linalg.norm(features.keypoints_px - [320, 240], axis=1)
         nearest, anywhere = np.argsort(aside), np.random.default_rng(6).permutation(len(aside))
         for known, count, settings, is_found in (
-            (nearest, 28, judging, False),
-            (nearest, 28, believing, True),
-            (anywhere, 28, judging, True),
+            (nearest, 36, judging, False),
+            (nearest, 36, believing, True),
+            (anywhere, 36, judging, True),
             (nearest, 200, judging, True),
         ):
             descriptors = strangers(features.descriptors, np.random.default_rng(5))
@@ -202,6 +203,16 @@ def test_what_differs_between_two_alike_places_decides(building):
     own[changed] = strangers(own[changed], rng)
     for wTc in building.path[:4]:
         assert off_m(find(double, building.features(wTc)), wTc) < 0.03
+
+
+def test_where_the_most_alike_keyframes_are_all_wrong_the_map_is_searched(building, monkeypatch):
+    ranked = PlaceIndex.ranked
+    monkeypatch.setattr(PlaceIndex, "ranked", lambda *args: ranked(*args)[::-1])
+    for wTc in building.path[:4]:
+        assert off_m(find(building.map, building.features(wTc)), wTc) < 0.03
+        with monkeypatch.context() as narrow:
+            narrow.setattr(relocalization, "_WIDE", 24)
+            assert isinstance(find(building.map, building.features(wTc)), str)
 
 
 def test_the_same_frame_and_seed_give_the_same_answer(building):
