@@ -17,7 +17,7 @@ from ground_station.progress import Progress
 from pi_firmware.wire.errors import BlimpError
 
 _TRIES = 2
-"""A job gets a second process where its first ended under it."""
+"""Processes that a job may end here; of a cluster at an address, its scheduler says."""
 
 
 def work(job: Job, folder: Path, data: Path) -> None:
@@ -170,7 +170,7 @@ def _until_done(
             try:
                 future.result()
             except KilledWorker:
-                _fail(store, open_[key], f"its process ended {_TRIES} times")
+                _fail(store, open_[key], "it ended each process that tried it")
             except BlimpError as caught:
                 error = error or caught
                 continue
