@@ -98,7 +98,9 @@ def test_a_quick_or_failed_run_or_a_readme_without_markers_is_not_accepted(tmp_p
     broken = json.loads(json.dumps(document))
     row = broken["experiments"][0]["cases"][0]["presets"]["default"]
     row["failed"] = row["accidents"] = ["it ended each process that tried it"]
-    with pytest.raises(InputError, match="Light, noon, default: it ended each process that tried it"):
+    with pytest.raises(
+        InputError, match="Light, noon, default: it ended each process that tried it"
+    ):
         report.accept(broken, page, accepted)
     assert not accepted.exists()
 
