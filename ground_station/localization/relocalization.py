@@ -136,7 +136,7 @@ def pose_from_matches(
 _RETRIEVED, _PLACES, _MIN_SHARED = 24, 3, 0.15
 """Keyframes retrieved, places tried, the share of landmarks that makes keyframes one place."""
 _WIDE = 30_000
-"""Landmarks that are searched at last, those of the most alike keyframes: a tenth of a second."""
+"""Landmarks that are searched at last, those of the most alike keyframes; it bounds the time."""
 _NEIGHBOURS = 12
 """Keyframes that saw most of a found pose's inliers: what they saw should be seen."""
 _MIN_MATCHED = 12
