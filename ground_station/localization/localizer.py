@@ -41,6 +41,8 @@ _USUAL_DEPTH_M = 5.0
 """How far off the landmarks of a map without units are taken to be: it says how fast is fast."""
 _FASTEST = 3.0
 """Standard deviations of the velocity that a camera may have."""
+_URGENT = 0.5
+"""Of the share of its points at which a keyframe is renewed: where it waits for no rest."""
 
 
 class LocalizationError(GroundStationError):
@@ -69,9 +71,10 @@ class Localizer:
         if not map_.info.registered and np.isfinite(map_.depth_m):
             settings = in_units(settings, map_.depth_m / _USUAL_DEPTH_M)
         self._smoothing = smoothing
-        self.overloaded = False
-        """Set by who must skip frames for lack of processor: keyframes are then renewed only where
-        they run out, or where a pose waits for one to be confirmed."""
+        self.rest_s = 0.0
+        """Raised by who must skip frames for lack of processor: a younger keyframe is then renewed
+        only where it runs out, or where a pose waits for one to be confirmed, and where this is
+        more than keyframes rest anyway, they carry half of the points."""
         camera, is_maps = against_map(map_.info, camera)
         self._of_focal = considered(map_, is_maps, settings.covariance.focal)
         self.map, self.camera, self.extractor, self.settings = map_, camera, extractor, settings
@@ -312,8 +315,8 @@ class Localizer:
     def _renew(self, attempt: Attempt, image: U8, followed: Followed) -> None:
         """Asks for the next keyframe when this one is old, far or half out of view.
 
-        Under overload only the last counts, or a doubt: an old one costs some accuracy and no pose.
-        One that shows but a part is none, as a whole one is soon to come.
+        One younger than `rest_s` must be worse than that: an old one costs some accuracy and no
+        pose. A frame that shows but a part is none, as a whole one is soon to come.
         """
         if attempt.taken.damaged is not None:
             return
@@ -322,11 +325,10 @@ class Localizer:
         age_s = (attempt.time_ns - keyframe.time_ns) / 1e9
         due = age_s >= settings.keyframe_interval_s
         due |= followed.moved_px >= settings.keyframe_parallax_px
-        if not self._worker.busy and (
-            (due and not self.overloaded)
-            or self._judge.doubtful
-            or attempt.counts.inliers < settings.keyframe_min_share * len(keyframe)
-        ):
+        share = attempt.counts.inliers / len(keyframe)
+        due |= share < settings.keyframe_min_share
+        urgent = self._judge.doubtful or share < _URGENT * settings.keyframe_min_share
+        if not self._worker.busy and (urgent or (due and age_s >= self.rest_s)):
             time_ns, taken = attempt.time_ns, attempt.taken
             state = self._estimator.predict(time_ns) or followed.solution.state
             promote = self._acquirer.promote
@@ -360,8 +362,11 @@ class Localizer:
         solved_ns = self._judge.last_solved_ns
         back = solved_ns is not None and solved_ns > landed.time_ns
         if not landed.searched or (back and not landed.relocalized):
-            self._keyframe = following.better(landed.keyframe, self._keyframe, self._followed)
-            self._denied = 0
+            chosen = following.better(landed.keyframe, self._keyframe, self._followed)
+            tracking = self.settings.tracking
+            if chosen is not self._keyframe and self.rest_s > tracking.keyframe_interval_s:
+                chosen = chosen.first(tracking.max_points // 2)
+            self._keyframe, self._denied = chosen, 0
             return False
         if back:
             return False  # tracking came back by itself while the whole map was searched

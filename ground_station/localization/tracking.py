@@ -78,7 +78,7 @@ class Keyframe:
 
     `image` (H, W) grey; `wTc` (4, 4); `pixel_px` (N, 2) in the (distorted) image; `landmark` (N,)
     indices into the map's landmarks; `points_m` (N, 3), where they are in the world; `sigma_px`
-    (N,), the standard deviation of each when it is followed.
+    (N,), the standard deviation of each when it is followed. They come as `spread_out` has them.
     """
 
     time_ns: int
@@ -91,6 +91,16 @@ class Keyframe:
 
     def __len__(self) -> int:
         return len(self.landmark)
+
+    def first(self, count: int) -> Keyframe:
+        """With so many points at most: the best of each part of the picture."""
+        return replace(
+            self,
+            pixel_px=self.pixel_px[:count],
+            landmark=self.landmark[:count],
+            points_m=self.points_m[:count],
+            sigma_px=self.sigma_px[:count],
+        )
 
     @cached_property
     def even(self) -> U8:

@@ -318,6 +318,20 @@ def test_frames_in_between_are_tracked_as_well_as_described_ones(wall):
     assert all(name.startswith("keyframes") for name in extractor.threads[1:])
 
 
+def test_rest_makes_keyframes_rare_and_light_and_costs_no_pose(wall):
+    described, seen = [], []
+    for rest_s in (0.0, 1.0):
+        localizer, extractor = started(wall)
+        localizer.rest_s = rest_s
+        estimates = fly(localizer, wall, range(60))
+        assert all(e.state is State.TRACKING for e in estimates)
+        assert all(within(e, wTc) for e, wTc in zip(estimates, TRUTH, strict=True))
+        described.append(len(extractor.threads))
+        seen.append(estimates[-1].counts.inliers)
+    assert described[1] <= 3 and described[0] >= 2 * described[1]
+    assert seen[1] <= localizer.settings.tracking.max_points // 2 < seen[0]
+
+
 def test_the_same_frames_give_the_same_poses_again(wall):
     first, second = (fly(started(wall)[0], wall, range(24)) for _ in range(2))
     for a, b in zip(first, second, strict=True):
