@@ -25,6 +25,10 @@ class MapError(GroundStationError):
     """A map that cannot be built, read or used with this localizer."""
 
 
+class MapInUseError(MapError):
+    """A map that another program is writing: it is free when that has ended."""
+
+
 class KeysError(GroundStationError):
     """An authority, certificate or key that cannot be made, read or used."""
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ground_station.calibration.errors import CalibrationError
-from ground_station.errors import GroundStationError, InputError, MapError
+from ground_station.errors import GroundStationError, InputError, MapError, MapInUseError
 from ground_station.experiments.plan import FlightJob, Job, LensJob, MapJob, Plan, RunJob
 from ground_station.experiments.store import Store
 from ground_station.mapping.settings import MappingSettings
@@ -37,6 +37,8 @@ def work(job: Job, folder: Path, data: Path) -> None:
             _run(job, store, data)
         else:
             _film(job, store.flight(job.name))
+    except MapInUseError:  # of a run that was killed a moment ago
+        raise
     except (MapError, CalibrationError) as error:
         store.write(job.key, {"failed": str(error)})
 

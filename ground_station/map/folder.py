@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from ground_station.errors import MapError
+from ground_station.errors import MapError, MapInUseError
 from pi_firmware.wire import files
 
 FLOORPLAN = ("floorplan.png", "floorplan.yaml")
@@ -151,7 +151,7 @@ def _alone(part: Path, folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise MapError(
+            raise MapInUseError(
                 f"{folder}: another command is writing this map: wait for it, or choose another"
                 " folder"
             ) from None

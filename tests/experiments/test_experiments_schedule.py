@@ -16,14 +16,15 @@ import dask
 import distributed
 import pytest
 
-from ground_station.errors import GroundStationError, InputError
-from ground_station.experiments import schedule
+from ground_station.errors import GroundStationError, InputError, MapInUseError
+from ground_station.experiments import maps, schedule
 from ground_station.experiments.declaration import Alteration, FlightDeclaration, MapSpec
 from ground_station.experiments.plan import FlightJob, LensJob, MapJob, Plan, RunJob
 from ground_station.experiments.schedule import carry_out
 from ground_station.experiments.store import Store
 from ground_station.geometry.camera import THESIS_CAMERA
 from ground_station.localization.settings import LocalizerSettings
+from ground_station.map.folder import replacing
 from ground_station.mapping.settings import MappingSettings
 from tests.waiting import eventually
 
@@ -127,6 +128,21 @@ def test_a_map_that_cannot_be_built_fails_its_runs_for_the_same_reason(tmp_path)
     carry_out(a_plan(), store, tmp_path, 2, no_map)
     assert [store.read(f"r{k}") for k in range(3)] == [{"failed": "no two images overlap"}] * 3
     assert done(tmp_path) == ["f"]
+
+
+def test_a_map_that_a_killed_run_is_still_writing_is_no_failure_that_is_kept(tmp_path, monkeypatch):
+    store, job = Store(tmp_path), a_plan().jobs["m"]
+
+    def build(spec, recording, data, settings, part, *more):
+        with replacing(part):
+            pass
+
+    monkeypatch.setattr(maps, "build", build)
+    store.map(job.key).parent.mkdir()
+    part = store.map(job.key).with_name(f"{job.key}.making")
+    with replacing(part), pytest.raises(MapInUseError):
+        schedule.work(job, tmp_path, tmp_path)
+    assert not store.done(job)
 
 
 def test_a_film_that_does_not_tell_the_camera_fails_what_needs_it_and_nothing_else(tmp_path):
