@@ -50,6 +50,15 @@ def test_it_ends_with_its_cause_and_with_a_new_count(localizer):
     assert overload.watch(localizer, 41.0, 1, 0) == ""
 
 
+def test_keyframes_that_rest_are_said_while_frames_are_skipped_now_and_then(localizer):
+    overload, said = Overload(), []
+    for k in range(15 * 30):
+        skipped = 1 + (k >= 60) + (k >= 120) if k >= 30 else 0
+        said.append(overload.watch(localizer, k / 30, k + 1 - skipped, skipped))
+    assert said[130] == "this computer is too slow: a keyframe in 3.0 s is what it bears"
+    assert said[29] == said[45] == said[-1] == "" and localizer.rest_s > RARE_S
+
+
 def test_late_features_alone_are_said_and_shed_nothing(localizer):
     localizer.keyframe_late_s = 1.4
     said = fly(Overload(), localizer, 1, 60)

@@ -40,10 +40,12 @@ LATE_S = 1.0
 """Features of a frame take a tenth of this where a core is free for them."""
 FIRST_REST_S, LONGEST_REST_S, RARE_S = 1.0, 4.0, 1.0
 """Between two keyframes, at the first frame that is skipped and at most; usual is a third of a
-second. From the last on it is said."""
+second. More than the last is said."""
 _EFFECT_S = 0.5
 """What a longer rest saves shows after this."""
 _HALVED_S = 8.0
+_SAID_S = 5.0
+"""After the last frame that was skipped: keyframes that rest still are no news then."""
 
 
 class Overload:
@@ -81,7 +83,7 @@ class Overload:
             what = f"{lost} of {told} frames skipped in {WINDOW_S:g} s; keyframes are rare"
         elif late_s > LATE_S:
             what = f"features under way for {late_s:.1f} s; keyframes are late"
-        elif rest_s > RARE_S:
+        elif rest_s > RARE_S and now_s < self._lengthened_s + _SAID_S:
             what = f"a keyframe in {rest_s:.1f} s is what it bears"
         else:
             return ""
