@@ -294,6 +294,9 @@ class Localizer:
 
     def _follow(self, attempt: Attempt, image: U8) -> PoseEstimate:
         relocalized = self._land(attempt)
+        tracking, keyframe = self.settings.tracking, self._keyframe
+        if keyframe is not None and self.rest_s > tracking.keyframe_interval_s:
+            self._keyframe = keyframe.first(tracking.max_points // 2)
         attempt.predicted = self._estimator.predict(attempt.time_ns)
         reason = f"searching; last refused: {self._refused}" if self._refused else "searching"
         if self._keyframe is not None and attempt.predicted is not None:
@@ -362,11 +365,8 @@ class Localizer:
         solved_ns = self._judge.last_solved_ns
         back = solved_ns is not None and solved_ns > landed.time_ns
         if not landed.searched or (back and not landed.relocalized):
-            chosen = following.better(landed.keyframe, self._keyframe, self._followed)
-            tracking = self.settings.tracking
-            if chosen is not self._keyframe and self.rest_s > tracking.keyframe_interval_s:
-                chosen = chosen.first(tracking.max_points // 2)
-            self._keyframe, self._denied = chosen, 0
+            self._keyframe = following.better(landed.keyframe, self._keyframe, self._followed)
+            self._denied = 0
             return False
         if back:
             return False  # tracking came back by itself while the whole map was searched

@@ -94,6 +94,8 @@ class Keyframe:
 
     def first(self, count: int) -> Keyframe:
         """With so many points at most: the best of each part of the picture."""
+        if len(self) <= count:
+            return self
         return replace(
             self,
             pixel_px=self.pixel_px[:count],
