@@ -15,8 +15,7 @@ import numpy as np
 from ground_station.arrays import F64, I64
 from ground_station.errors import MapError
 from ground_station.geometry.camera import Camera
-from ground_station.localization.settings import LocalizerSettings, ProjectionSettings, load_preset
-from ground_station.localization.visibility import LandmarkIndex, project
+from ground_station.localization.settings import LocalizerSettings, load_preset
 from ground_station.map import colmap, store
 from ground_station.map.folder import (
     carry_floorplan,
@@ -43,13 +42,11 @@ from ground_station.map_update.extension.localizing import LocatedFlight, locali
 from ground_station.map_update.extension.merging import merge, observation_descriptors
 from ground_station.map_update.extension.structure import LOOSE_PX, Structure, weak_points
 from ground_station.map_update.extension.tracks import joined, match_frames, pairs_to_match
+from ground_station.map_update.missing import times_in_view
 from ground_station.mapping.settings import MappingSettings
 from ground_station.mapping.sfm.models import without_images, without_points
 from ground_station.progress import Progress
 from ground_station.recording.frames import FrameRange
-
-_CONES = ProjectionSettings(viewing_cone=True, cone_margin_deg=5.0, max_distance_ratio=1.2)
-"""Places from which a keyframe saw a landmark, or nearly: from elsewhere something may hide it."""
 
 
 def never_seen(map_: Map, wTc: F64, seen: I64, often: int) -> dict[str, int]:
@@ -57,13 +54,7 @@ def never_seen(map_: Map, wTc: F64, seen: I64, often: int) -> dict[str, int]:
 
     `seen` are those that were. They are counted and not removed: another light hides, too.
     """
-    camera, index = map_.info.camera, LandmarkIndex(map_.landmarks)
-    times = np.zeros(len(map_.landmarks), np.int64)
-    for T in wTc:
-        times[
-            project(map_.landmarks, T, camera, _CONES, index.near(T, camera, _CONES)).landmark
-        ] += 1
-    expected = times >= often
+    expected = times_in_view(map_, wTc, map_.info.camera) >= often
     missed = expected.copy()
     missed[seen] = False
     return {"expected": int(expected.sum()), "never_seen": int(missed.sum())}

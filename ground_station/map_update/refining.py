@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ground_station.map.table import print_table
+
+if TYPE_CHECKING:
+    from ground_station.arrays import F64
+    from ground_station.map_update.missing import Area
 
 HELP = "Adds what flights saw to a map, and adjusts it."
 
@@ -21,7 +25,10 @@ example:
 Poses and landmarks move together until all observations fit best; the map stays where it is
 registered, and registering it again with the same points takes it nearer still. The old map is kept
 beside the new one, as MAP.before, until you delete it. Without EST the map's own observations are
-adjusted again, with the rolling shutter taken out."""
+adjusted again, with the rolling shutter taken out. Places whose landmarks the flights should have
+seen and never did are named: what was there was moved, or something stands before it."""
+
+_MOST_AREAS = 10
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +50,9 @@ def run(args: argparse.Namespace) -> int:
     """Refines; raises `BlimpError` for what a person can fix."""
     from ground_station.errors import MapError
     from ground_station.files import check_outputs, write_json
+    from ground_station.map import store
     from ground_station.map.observations import load_observations
+    from ground_station.map_update.missing import missing_areas
     from ground_station.mapping.refinement.refine import refine_map
     from ground_station.mapping.settings import load_settings
 
@@ -53,9 +62,18 @@ def run(args: argparse.Namespace) -> int:
     check_outputs(args.json)
     check_outputs(args.out, are_folders=True)
     flights = [load_observations(path) for path in args.observations]
+    before = store.load(args.map)
     refined, result = refine_map(args.map, flights, settings, args.out)
-    report = result.report
-    print_table(_shown(report))
+    areas = missing_areas(before, flights, settings.extend.expected_often)
+    report = result.report | {"missing": [_plain(area) for area in areas]}
+    print_table(_shown(result.report))
+    unit = "m" if before.info.registered else "of the map's units"
+    for area in areas[:_MOST_AREAS]:
+        print(
+            f"missing: {area.missing} of {area.expected} landmarks about "
+            f"({_point(area.middle_m)}), {_point(area.size_m, ' x ')} {unit}, were often in view "
+            "and never seen: what was there was moved, or something stands before it"
+        )
     if result.kept is not None:
         print(f"the old map is kept in {result.kept}")
     method = refined.info.registration.get("method")
@@ -70,6 +88,19 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         write_json(args.json, report)
     return 0
+
+
+def _plain(area: Area) -> dict[str, Any]:
+    return {
+        "middle_m": area.middle_m.tolist(),
+        "size_m": area.size_m.tolist(),
+        "expected": area.expected,
+        "missing": area.missing,
+    }
+
+
+def _point(values: F64, between: str = ", ") -> str:
+    return between.join(f"{value:.1f}" for value in values)
 
 
 def _shown(report: dict[str, Any]) -> dict[str, Any]:
