@@ -7,10 +7,10 @@ import argparse
 from ground_station.inspection import command as info
 from ground_station.inspection import export_command as export
 from ground_station.inspection import view_command as view
+from ground_station.map_update import refining as refine
 from ground_station.map_update.extension import command as extend
 from ground_station.mapping.construction import command as build
 from ground_station.mapping.importing import command as importing
-from ground_station.map_update import refining as refine
 from ground_station.mapping.registration import command as register
 
 _COMMANDS = {

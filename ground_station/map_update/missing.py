@@ -3,7 +3,7 @@
 A flight uses a few hundred landmarks at a time, and light, blur and what stands before them hide
 others, so that one that is not seen says little. Those of a place that are nearly all missing,
 where elsewhere one of seven or eight is, say that the place is another, or that something stands
-before it.
+before it; or, where the light is not the map's, that it is lit otherwise.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ Poses and landmarks move together until all observations fit best; the map stays
 registered, and registering it again with the same points takes it nearer still. The old map is kept
 beside the new one, as MAP.before, until you delete it. Without EST the map's own observations are
 adjusted again, with the rolling shutter taken out. Places whose landmarks the flights should have
-seen and never did are named: what was there was moved, or something stands before it."""
+seen and never did are named: what was there was moved or is lit otherwise, or is hidden now."""
 
 _MOST_AREAS = 10
 
@@ -67,12 +67,15 @@ def run(args: argparse.Namespace) -> int:
     areas = missing_areas(before, flights, settings.extend.expected_often)
     report = result.report | {"missing": [_plain(area) for area in areas]}
     print_table(_shown(result.report))
-    unit = "m" if before.info.registered else "of the map's units"
+    unit = "metres" if before.info.registered else "the map's units"
+    if areas:
+        print(
+            f"often in view and never seen, places in {unit} (moved, lit otherwise, or hidden now):"
+        )
     for area in areas[:_MOST_AREAS]:
         print(
-            f"missing: {area.missing} of {area.expected} landmarks about "
-            f"({_point(area.middle_m)}), {_point(area.size_m, ' x ')} {unit}, were often in view "
-            "and never seen: what was there was moved, or something stands before it"
+            f"  {area.missing} of {area.expected} landmarks about ({_point(area.middle_m)}), "
+            f"{_point(area.size_m, ' x ')}"
         )
     if result.kept is not None:
         print(f"the old map is kept in {result.kept}")
