@@ -39,25 +39,27 @@ SKIPPED = 0.05
 LATE_S = 1.0
 """Features of a frame take a tenth of this where a core is free for them."""
 FIRST_REST_S, LONGEST_REST_S, RARE_S = 1.0, 4.0, 1.0
-"""Between two keyframes, at the first frame that is skipped and at most; usual is a third of a
+"""Between two keyframes, at first and at most; usual is a third of a
 second. More than the last is said."""
 _EFFECT_S = 0.5
 """What a longer rest saves shows after this."""
 _HALVED_S = 8.0
-_SAID_S = 5.0
-"""After the last frame that was skipped: keyframes that rest still are no news then."""
+_AGAIN_S = 5.0
+"""A frame that is skipped so long after the one before is an accident, and keyframes that rest
+still are no news."""
 
 
 class Overload:
     """Whether frames are skipped, or features late, for lack of processor; its state in words.
 
-    A skipped frame doubles the rest between two keyframes, whose features cost as much as all else,
-    and time without one shortens it: what is left of the processor is found as TCP finds a link's.
+    Frames that are skipped again and again double the rest between two keyframes, whose features
+    cost as much as all else, and time without shortens it: what is left of the processor is found
+    as TCP finds a link's.
     """
 
     def __init__(self) -> None:
         self._counts: deque[tuple[float, int, int]] = deque()
-        self._lengthened_s = float("-inf")
+        self._skipped_s = self._lengthened_s = float("-inf")
 
     def watch(self, localizer: Localizer, now_s: float, taken: int, skipped: int) -> str:
         """After each frame; the localizer is told, and the answer is "" while all is well.
@@ -74,16 +76,19 @@ class Overload:
         lost = skipped - counts[0][2]
         told = lost + taken - counts[0][1]
         rest_s = localizer.rest_s * 0.5 ** ((now_s - last_s) / _HALVED_S)
-        if skipped > last_skipped and now_s >= self._lengthened_s + _EFFECT_S:
-            self._lengthened_s = now_s
-            rest_s = min(max(FIRST_REST_S, 2 * rest_s), LONGEST_REST_S)
+        if skipped > last_skipped:
+            again = now_s < self._skipped_s + _AGAIN_S
+            self._skipped_s = now_s
+            if again and now_s >= self._lengthened_s + _EFFECT_S:
+                self._lengthened_s = now_s
+                rest_s = min(max(FIRST_REST_S, 2 * rest_s), LONGEST_REST_S)
         localizer.rest_s = rest_s
         late_s = localizer.keyframe_late_s
         if lost > SKIPPED * told:
             what = f"{lost} of {told} frames skipped in {WINDOW_S:g} s; keyframes are rare"
         elif late_s > LATE_S:
             what = f"features under way for {late_s:.1f} s; keyframes are late"
-        elif rest_s > RARE_S and now_s < self._lengthened_s + _SAID_S:
+        elif rest_s > RARE_S and now_s < self._lengthened_s + _AGAIN_S:
             what = f"a keyframe in {rest_s:.1f} s is what it bears"
         else:
             return ""
