@@ -78,7 +78,7 @@ class Keyframe:
 
     `image` (H, W) grey; `wTc` (4, 4); `pixel_px` (N, 2) in the (distorted) image; `landmark` (N,)
     indices into the map's landmarks; `points_m` (N, 3), where they are in the world; `sigma_px`
-    (N,), the standard deviation of each when it is followed. They come as `spread_out` has them.
+    (N,), the standard deviation of each when it is followed. The best come first.
     """
 
     time_ns: int
@@ -96,12 +96,13 @@ class Keyframe:
         """With so many points at most: the best of each part of the picture."""
         if len(self) <= count:
             return self
+        kept = spread_out(self.pixel_px, count)
         return replace(
             self,
-            pixel_px=self.pixel_px[:count],
-            landmark=self.landmark[:count],
-            points_m=self.points_m[:count],
-            sigma_px=self.sigma_px[:count],
+            pixel_px=self.pixel_px[kept],
+            landmark=self.landmark[kept],
+            points_m=self.points_m[kept],
+            sigma_px=self.sigma_px[kept],
         )
 
     @cached_property

@@ -35,9 +35,6 @@ _CELL = 0.08
 _FAR = 2.0
 """Of that depth: landmarks that no keyframe saw from nearer are small, and seldom followed."""
 
-_WELL_SEEN = 6
-"""Keyframes that a landmark was found in when it was mapped: what few found, few will."""
-
 _MISSING = 0.75
 """Of a place's landmarks: so many are never seen where it is another."""
 
@@ -68,7 +65,8 @@ def times_in_view(map_: Map, wTc: Iterable[F64], camera: Camera) -> I64:
 def missing_areas(map_: Map, flights: Sequence[FlightObservations], often: int) -> list[Area]:
     """Places whose landmarks were `often` in view of the flights and are missing, most first.
 
-    Lengths are in the map's own units where it is not registered.
+    Its constants were chosen on two flights through one simulated hall. Lengths are in the map's
+    own units where it is not registered.
     """
     landmarks = map_.landmarks
     times, seen = np.zeros(len(landmarks), np.int64), np.zeros(len(landmarks), bool)
@@ -77,10 +75,11 @@ def missing_areas(map_: Map, flights: Sequence[FlightObservations], often: int) 
         apart = np.flatnonzero(np.diff(step, prepend=-1) > 0)
         times += times_in_view(map_, flight.wTc[apart], flight.camera)
         seen |= np.isin(landmarks.id, flight.landmark)
-    fair = (landmarks.observations >= _WELL_SEEN) & (
-        landmarks.distance_m[:, 0] <= _FAR * map_.depth_m
-    )
-    fair &= times >= often
+    if not len(landmarks):
+        return []
+    # What fewer keyframes found than half of the landmarks were found in, few frames will find.
+    fair = landmarks.observations >= np.median(landmarks.observations)
+    fair &= (landmarks.distance_m[:, 0] <= _FAR * map_.depth_m) & (times >= often)
     position, missed = landmarks.position_m[fair], ~seen[fair]
     if not len(position):
         return []

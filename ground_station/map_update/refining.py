@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ground_station.map.table import print_table
+from ground_station.map_update.outputs import add_outputs, checked
 
 if TYPE_CHECKING:
     from ground_station.arrays import F64
@@ -33,7 +33,6 @@ _MOST_AREAS = 10
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of `blimp map refine`."""
-    parser.set_defaults(next="blimp map view {out|map} --out map.html --open")
     parser.add_argument("map", metavar="MAP", help="folder of the map")
     parser.add_argument(
         "observations",
@@ -41,26 +40,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="EST",
         help="what 'blimp localize --observations' wrote, one file a flight",
     )
-    parser.add_argument("--out", metavar="NEWMAP", help="write here and leave MAP as it is")
-    parser.add_argument("--settings", metavar="TOML", help="settings file (default: the shipped)")
-    parser.add_argument("--json", metavar="FILE", help="write what was measured, too")
+    add_outputs(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Refines; raises `BlimpError` for what a person can fix."""
-    from ground_station.errors import MapError
-    from ground_station.files import check_outputs, write_json
+    from ground_station.files import write_json
     from ground_station.map import store
     from ground_station.map.observations import load_observations
     from ground_station.map_update.missing import missing_areas
     from ground_station.mapping.refinement.refine import refine_map
-    from ground_station.mapping.settings import load_settings
 
-    settings = load_settings(args.settings)
-    if args.out and Path(args.out).resolve() == Path(args.map).resolve():
-        raise MapError(f"--out {args.out}: is the map itself; leave --out away to replace it")
-    check_outputs(args.json)
-    check_outputs(args.out, are_folders=True)
+    settings = checked(args)
     flights = [load_observations(path) for path in args.observations]
     before = store.load(args.map)
     refined, result = refine_map(args.map, flights, settings, args.out)

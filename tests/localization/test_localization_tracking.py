@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import threading
+from dataclasses import replace
 from functools import cached_property
 
 import cv2
@@ -300,6 +301,20 @@ def test_points_are_kept_evenly_and_the_best_first():
     chosen = spread_out(np.concatenate([crowd, rest]), 10)
     assert len(chosen) == 10 and {500, 501, 502, 0} <= set(chosen.tolist())
     assert spread_out(rest, 10).tolist() == [0, 1, 2]
+
+
+def test_a_keyframe_of_fewer_points_keeps_the_best_of_each_part(wall):
+    whole = wall.keyframe(np.eye(4)).first(40)
+    crowd = np.tile([[100.0, 100.0]], (30, 1))  # the best, all at one place
+    others = np.array([[50.0 * k, 300.0] for k in range(1, 11)])
+    whole = replace(whole, pixel_px=np.concatenate([crowd, others]).astype(np.float32))
+    few = whole.first(15)
+    kept = [*range(5), *range(30, 40)]
+    assert sorted(few.landmark) == sorted(whole.landmark[kept])
+    at = [whole.landmark.tolist().index(one) for one in few.landmark]
+    assert np.array_equal(few.pixel_px, whole.pixel_px[at])
+    assert np.array_equal(few.points_m, whole.points_m[at])
+    assert whole.first(40) is whole
 
 
 def test_frames_in_between_are_tracked_as_well_as_described_ones(wall):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import Any
 
 from ground_station.map.table import print_table
+from ground_station.map_update.outputs import add_outputs, checked
 
 HELP = "Adds flights under another light, or of another wing, to a map."
 
@@ -23,31 +23,22 @@ MAP.before, until you delete it. To let poses and landmarks move, too, see 'blim
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Adds the arguments of `blimp map extend`."""
-    parser.set_defaults(next="blimp map view {out|map} --out map.html --open")
     parser.add_argument("map", metavar="MAP", help="folder of the map")
     parser.add_argument("inputs", nargs="+", metavar="INPUT", help="recording, video or folder")
     parser.add_argument("--camera", metavar="TOML", help="default: the input's own, else the map's")
-    parser.add_argument("--out", metavar="MAP2", help="write here and leave MAP as it is")
     parser.add_argument("--range", metavar="A:B[:S]", help="frames A up to B, every S-th")
     parser.add_argument("--rate-hz", type=float, default=30.0, help="of a folder (default 30)")
-    parser.add_argument("--settings", metavar="TOML", help="settings file (default: the shipped)")
-    parser.add_argument("--json", metavar="FILE", help="write what was measured, too")
+    add_outputs(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Extends; raises `BlimpError` for what a person can fix."""
-    from ground_station.errors import MapError
-    from ground_station.files import check_outputs, write_json
+    from ground_station.files import write_json
     from ground_station.geometry.camera import load_camera
     from ground_station.map_update.extension.extend import extend_map
-    from ground_station.mapping.settings import load_settings
     from ground_station.recording.open import parse_range
 
-    settings = load_settings(args.settings)
-    if args.out and Path(args.out).resolve() == Path(args.map).resolve():
-        raise MapError(f"--out {args.out}: is the map itself; leave --out away to replace it")
-    check_outputs(args.json)
-    check_outputs(args.out, are_folders=True)
+    settings = checked(args)
     _, result = extend_map(
         args.map,
         args.inputs,

@@ -44,6 +44,7 @@ second. More than the last is said."""
 _EFFECT_S = 0.5
 """What a longer rest saves shows after this."""
 _HALVED_S = 8.0
+"""In this a rest that is too long shrinks by half: slower than it grows, so that few frames pay."""
 _AGAIN_S = 5.0
 """A frame that is skipped so long after the one before is an accident, and keyframes that rest
 still are no news."""
