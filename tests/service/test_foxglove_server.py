@@ -10,6 +10,7 @@ import socket
 import subprocess
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -435,11 +436,14 @@ def test_a_full_inbox_loses_the_oldest() -> None:
 def test_a_payload_that_is_gone_gives_its_place_to_a_new_one(tmp_path: Path) -> None:
     """The 33rd of an evening had no topics until a restart."""
     with Station(tmp_path) as station, server(tmp_path) as (_, port), Client(port) as client:
-        for number in range(PAYLOADS + 2):
-            name = f"flown-{number}"
+
+        def come_and_go(name: str) -> None:
             for alive in (True, False):
                 station.bus.publish(bus_messages.PAYLOAD, name, PayloadMessage(alive, 0))
-            topic = f"/{name}/status"
-            client.until(lambda topic=topic: topic in client.channels, topic)
+
+        for number in range(PAYLOADS + 2):
+            topic, flown = f"/flown-{number}/status", partial(come_and_go, f"flown-{number}")
+            flown()
+            client.until(lambda topic=topic: topic in client.channels, topic, flown)
         client.until(lambda: "/flown-1/status" not in client.channels, "the end of its topics")
         assert f"/flown-{PAYLOADS + 1}/status" in client.channels
