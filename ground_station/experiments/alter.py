@@ -1,124 +1,110 @@
-"""What happens to a flight's frames on their way, and to the landmarks of the map they meet."""
+"""What happens to a flight's frames on their way, and to the map they meet, in a row of a table."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+import functools
+import importlib
+import pkgutil
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
-import cv2
-import numpy as np
-
-from ground_station.arrays import U8, Bools, Indices
-from ground_station.experiments.declaration import Alteration
+from ground_station.arrays import Bools
+from ground_station.experiments import disturbances
+from ground_station.experiments.disturbance import Disturbance
+from ground_station.experiments.material import Flown
 from ground_station.geometry.camera import Camera
-from ground_station.geometry.resizing import scaled
-from ground_station.map.descriptors import Descriptors
-from ground_station.map.store import Landmarks, Map, MapInfo
+from ground_station.map.store import Map
 from ground_station.recording.frames import Frame
-from pi_firmware.wire import annexb
-
-PACKET_BYTES = 1200
-"""Of video in an RTP packet, as the payload's packetizer makes them."""
+from pi_firmware.wire import config
+from pi_firmware.wire.errors import ConfigError
 
 
-def altered(
-    frames: Iterable[Frame], alteration: Alteration, arrived: Bools | None = None
-) -> Iterator[Frame]:
-    """The frames that a localizer sees.
-
-    `arrived` (n,) says of each frame of the flight, by its index, whether it could be decoded;
-    None: all. Times, and the indices in the flight, stay.
-    """
-    start_ns: int | None = None
-    for frame in frames:
-        start_ns = frame.time_ns if start_ns is None else start_ns
-        if frame.index % alteration.every or (arrived is not None and not arrived[frame.index]):
-            continue
-        yield replace(frame, image=_seen(frame, alteration, (frame.time_ns - start_ns) / 1e9))
+@functools.cache
+def kinds() -> dict[str, type[Disturbance]]:
+    """The disturbance that each key of `alter` belongs to."""
+    modules = (
+        importlib.import_module(f"{disturbances.__name__}.{found.name}")
+        for found in pkgutil.iter_modules(disturbances.__path__)
+    )
+    return {
+        key.name: module.DISTURBANCE for module in modules for key in fields(module.DISTURBANCE)
+    }
 
 
-def _seen(frame: Frame, alteration: Alteration, time_s: float) -> U8:
-    image = frame.image
-    if is_dark(alteration, time_s):
-        image = np.zeros_like(image)
-    if alteration.scale < 1:
-        height, width = scaled_size(image.shape[1], image.shape[0], alteration.scale)[::-1]
-        image = np.asarray(
-            cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8
+@dataclass(frozen=True)
+class Alteration:
+    """Some disturbances, pictures in the order of their files' names."""
+
+    parts: tuple[Disturbance, ...] = ()
+
+    @classmethod
+    def of(cls, table: Mapping[str, Any], where: str) -> Alteration:
+        """From a row's table `alter`; raises `ConfigError`."""
+        known = kinds()
+        for name in table:
+            if name not in known:
+                there = ", ".join(sorted(known))
+                raise ConfigError(f"{where}: unknown key 'alter.{name:.60}' (known here: {there})")
+        return cls(
+            tuple(
+                config.from_mapping(
+                    {name: value for name, value in table.items() if known[name] is kind},
+                    kind,
+                    where=f"{where}: alter",
+                )
+                for kind in dict.fromkeys(known.values())
+                if any(known[name] is kind for name in table)
+            )
         )
-    if alteration.blur_px > 0:
-        image = np.asarray(cv2.GaussianBlur(image, (0, 0), alteration.blur_px), np.uint8)
-    return image
 
+    def keeps(self, index: int) -> bool:
+        """Whether the frame of that index in the flight is seen, unless it was lost on its way."""
+        return all(part.keeps(index) for part in self.parts)
 
-def told_ns(frame: Frame, alteration: Alteration, seed: int) -> int:
-    """The time that the localizer is told, in the clock of the frame's own: off by chance."""
-    off_s = alteration.stamp_error_s * np.random.default_rng((seed, frame.index)).standard_normal()
-    return frame.time_ns + round(1e9 * off_s)
+    def frames(self, frames: Iterable[Frame], arrived: Bools | None = None) -> Iterator[Frame]:
+        """The frames that a localizer sees.
 
+        `arrived` (n,) says of each frame of the flight, by its index, whether it could be decoded;
+        None: all. Times, and the indices in the flight, stay.
+        """
+        start_ns: int | None = None
+        for frame in frames:
+            start_ns = frame.time_ns if start_ns is None else start_ns
+            if not self.keeps(frame.index) or (arrived is not None and not arrived[frame.index]):
+                continue
+            image, time_s = frame.image, (frame.time_ns - start_ns) / 1e9
+            for part in self.parts:
+                image = part.picture(image, time_s)
+            yield replace(frame, image=image)
 
-def is_dark(alteration: Alteration, time_s: float) -> bool:
-    """Whether the lens is covered `time_s` after the flight's first frame."""
-    return 0 <= time_s - alteration.dark_from_s < alteration.dark_s
-
-
-def scaled_size(width_px: int, height_px: int, scale: float) -> tuple[int, int]:
-    """Width and height of a picture at that scale, at least 16 px each."""
-    return max(16, round(width_px * scale)), max(16, round(height_px * scale))
-
-
-def scaled_camera(camera: Camera, scale: float) -> Camera:
-    """The camera of pictures at that scale."""
-    if scale >= 1:
+    def camera(self, camera: Camera) -> Camera:
+        """The camera of the frames that are seen."""
+        for part in self.parts:
+            camera = part.camera(camera)
         return camera
-    return scaled(camera, *scaled_size(camera.width_px, camera.height_px, scale))
 
+    def told_ns(self, frame: Frame, seed: int) -> int:
+        """The time that the localizer is told, in the clock of the frame's own."""
+        late_s = sum(part.late_s(frame.index, seed) for part in self.parts)
+        return frame.time_ns + round(1e9 * late_s)
 
-def arrivals(units: Iterable[bytes], packet_loss: float, seed: int) -> Bools:
-    """Which access units of an H.264 stream can be decoded when packets are lost one by one (n,).
+    def arrivals(self, flight: Flown, seed: int) -> Bools | None:
+        """Which frames of a recorded flight can be decoded (n,); None: all."""
+        if flight.recording is None:
+            return None
+        found = [part.arrivals(flight.units, seed) for part in self.parts]
+        lossy = [arrived for arrived in found if arrived is not None]
+        return functools.reduce(lambda a, b: a & b, lossy) if lossy else None
 
-    A unit goes in packets of `PACKET_BYTES`; one that misses a packet is useless, and so is all
-    after it up to the next IDR, because each picture is predicted from the one before. A live link
-    sends lost packets again and asks for an IDR, which a recording cannot: it loses far less.
-    """
-    rng = np.random.default_rng(seed)
-    whole = False
-    result = []
-    for unit in units:
-        packets = -(-len(unit) // PACKET_BYTES)
-        complete = bool((rng.random(packets) >= packet_loss).all())
-        whole = complete and (whole or annexb.is_idr(unit))
-        result.append(whole)
-    return np.array(result, dtype=bool)
+    def map(self, map_: Map, seed: int) -> Map:
+        """The map that is flown in."""
+        for part in self.parts:
+            map_ = part.map(map_, seed)
+        return map_
 
-
-def drawn(map_: Map, share: float, seed: int) -> Map:
-    """The map with that share of its landmarks; by one seed, a smaller share is in a larger one."""
-    total = len(map_.landmarks)
-    order = np.random.default_rng(seed).permutation(total)
-    return subset(map_, np.sort(order[: round(share * total)]))
-
-
-def subset(map_: Map, kept: Indices) -> Map:
-    """The map with some of its landmarks (N,), in order, their modes, and all of its keyframes."""
-    lm, kf = map_.landmarks, map_.keyframes
-    names = [field.name for field in dataclasses.fields(Landmarks)]
-    rows = {name: getattr(lm, name)[kept] for name in names if name != "descriptor"}
-    descriptor = lm.descriptor
-    rows["descriptor"] = (
-        descriptor.rows(kept) if isinstance(descriptor, Descriptors) else descriptor[kept]
-    )
-    place = np.full(len(lm), -1, np.int64)
-    place[kept] = np.arange(len(kept))
-    landmark = place[kf.landmark]
-    left = landmark >= 0
-    keyframes = dataclasses.replace(
-        kf,
-        offset=np.concatenate([[0], np.cumsum(left)])[kf.offset],
-        landmark=landmark[left].astype(np.int32),
-        pixel_px=kf.pixel_px[left],
-    )
-    modes = map_.modes.among(place >= 0) if map_.modes is not None else None
-    info = MapInfo(**vars(map_.info))
-    return Map(info, Landmarks(**rows), keyframes, map_.folder, modes)
+    @property
+    def blind_until_s(self) -> float | None:
+        """When a lens that was covered sees again, after the flight's first frame."""
+        ends = [end for part in self.parts if (end := part.blind_until_s) is not None]
+        return max(ends, default=None)

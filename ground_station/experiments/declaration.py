@@ -82,33 +82,6 @@ class FlightDeclaration:
 
 
 @dataclass(frozen=True)
-class Alteration:
-    """What happens to a flight's frames before they are localized, and to the map they meet."""
-
-    every: int = config.key(1, "one frame in so many is seen", unit="frames", low=1, high=100)
-    scale: float = config.key(1.0, "side of the picture over the flight's", low=0.1, high=1.0)
-    blur_px: float = config.key(
-        0.0, "standard deviation of a Gaussian blur", unit="px", low=0.0, high=50.0
-    )
-    packet_loss: float = config.key(
-        0.0,
-        "share of the video's packets lost; what needs them is not seen",
-        low=0.0,
-        high=1.0,
-    )
-    dark_from_s: float = config.key(
-        0.0, "the lens is covered from then on", unit="s", low=0.0, high=3600
-    )
-    dark_s: float = config.key(0.0, "for so long; 0: never", unit="s", low=0.0, high=3600)
-    stamp_error_s: float = config.key(
-        0.0, "standard deviation of the frames' times", unit="s", low=0.0, high=0.1
-    )
-    landmarks: float = config.key(
-        1.0, "share of the map's landmarks that is there, drawn at random", low=0.01, high=1.0
-    )
-
-
-@dataclass(frozen=True)
 class MapSpec:
     """A map: of which flight, of how many of its frames, with which features."""
 
@@ -169,7 +142,7 @@ class Row:
     presets: list[str] = config.key(list(PRESETS), "which of the localizer's", choices=PRESETS)
     map: MapSpec = config.table(MapSpec)
     flight: FlightDeclaration = config.table(FlightDeclaration)
-    alter: Alteration = config.table(Alteration)
+    alter: dict[str, Any] = config.key({}, "keys of `disturbances/`, checked by these")
     localizer: dict[str, Any] = config.key({}, "checked by its settings, when a preset is known")
     thesis: Figures = config.table(Figures)
     cause: str = config.key("", "why the default is the worse one here, as far as it is known")

@@ -18,8 +18,7 @@ import numpy as np
 from ground_station.arrays import F64, U8
 from ground_station.errors import InputError
 from ground_station.evaluation import ate
-from ground_station.experiments.alter import altered, arrivals, scaled_camera, told_ns
-from ground_station.experiments.declaration import Alteration
+from ground_station.experiments.alter import Alteration
 from ground_station.experiments.maps import displacement
 from ground_station.experiments.material import Flown
 from ground_station.features.extractor import Extractor
@@ -116,7 +115,7 @@ def measure(
     """
     features = replace(settings.features, extractor=OF_THE_MAP)
     settings = replace(settings, features=features)
-    camera = scaled_camera(flight.camera, alteration.scale)
+    camera = alteration.camera(flight.camera)
     localizer: Localizer | Alone
     if preset == "alone":
         plain = replace(features, max_features=_FEATURES)
@@ -127,16 +126,15 @@ def measure(
         if preset == "thesis":
             first = next(iter(flight.frames))
             wTc = flight.truth.wTc[flight.truth.nearest(first.time_ns)]
-            localizer.set_initial_pose(wTc, told_ns(first, alteration, seed))
-    lossy = alteration.packet_loss > 0 and flight.recording is not None
-    arrived = arrivals(flight.units(), alteration.packet_loss, seed) if lossy else None
+            localizer.set_initial_pose(wTc, alteration.told_ns(first, seed))
+    arrived = alteration.arrivals(flight, seed)
     start_ns = next(iter(flight.frames)).time_ns
     estimates: list[PoseEstimate] = []
     smoothed: list[Kinematics] = []
     step = _ALONE_EVERY if preset == "alone" and flight.recording is not None else 1
     true_ns: dict[int, int] = {}
-    for frame in itertools.islice(altered(flight.frames, alteration, arrived), 0, None, step):
-        time_ns = told_ns(frame, alteration, seed)
+    for frame in itertools.islice(alteration.frames(flight.frames, arrived), 0, None, step):
+        time_ns = alteration.told_ns(frame, seed)
         true_ns[time_ns] = frame.time_ns
         estimate = localizer.process(time_ns, frame.image, frame.index, frame.exposure_s)
         estimates.append(replace(estimate, time_ns=frame.time_ns))
@@ -149,7 +147,7 @@ def measure(
     captured = flight.frames.count() or len(estimates)
     return {
         "captured": captured,
-        "frames": -(-captured // (alteration.every * step)),
+        "frames": -(-sum(map(alteration.keeps, range(captured))) // step),
         "seen_s": [round((e.time_ns - start_ns) / 1e9, 4) for e in estimates],
         "localized": sum(e.localized for e in estimates),
         "tracking": len(tracking),
@@ -159,7 +157,7 @@ def measure(
         "landmarks": len(map_.landmarks),
         "keyframes": len(map_.keyframes),
         "stage_s": _stages(estimates),
-        "recovery_s": _recovery_s(estimates, flight.truth, alteration),
+        "recovery_s": _recovery_s(estimates, flight.truth, alteration.blind_until_s),
         "consistency": _consistency(
             [(c, error) for e, error in off if (c := e.covariance) is not None]
         ),
@@ -242,12 +240,12 @@ def _smoothed(states: Sequence[Kinematics], truth: Trajectory) -> dict[str, Any]
 
 
 def _recovery_s(
-    estimates: Sequence[PoseEstimate], truth: Trajectory, alteration: Alteration
+    estimates: Sequence[PoseEstimate], truth: Trajectory, blind_until_s: float | None
 ) -> float | None:
     """From the uncovered lens to a TRACKING pose near the true one; None: never, or not covered."""
-    if alteration.dark_s <= 0 or not estimates:
+    if blind_until_s is None or not estimates:
         return None
-    end_ns = estimates[0].time_ns + round((alteration.dark_from_s + alteration.dark_s) * 1e9)
+    end_ns = estimates[0].time_ns + round(blind_until_s * 1e9)
     for e in estimates:
         if e.time_ns < end_ns or e.state is not State.TRACKING or e.wTc is None:
             continue

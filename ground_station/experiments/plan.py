@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from ground_station.errors import InputError
+from ground_station.experiments.alter import Alteration
 from ground_station.experiments.declaration import (
-    Alteration,
     Case,
     Declaration,
     FlightDeclaration,
@@ -116,6 +116,7 @@ def _runs(
     data: Path,
 ) -> list[str]:
     where = f"experiment '{case.experiment}', case '{case.name}', preset '{preset}'"
+    alter = Alteration.of(case.alter, where)
     settings = load_preset("default")  # of `alone` its features' only
     if preset != "alone":
         settings = changed(load_preset(preset), case.localizer, where)
@@ -129,14 +130,14 @@ def _runs(
             "map": map_job.key,
             "flight": flown.depends,
             "seed": seed,
-            "alter": asdict(case.alter),
+            "alter": case.alter,
             "preset": preset,
             "settings": asdict(settings),
             "code": code_sha256("run"),
         }
         key = _key("run", depends)
         job = RunJob(
-            key, map_job.key, flight, flown.recording, seed, case.alter, preset, settings,
+            key, map_job.key, flight, flown.recording, seed, alter, preset, settings,
             flown.lens,
         )  # fmt: skip
         _add(plan, job, (map_job.key, *flown.needs))
@@ -245,6 +246,7 @@ ROOMS = {
     "map": ("experiments/maps.py", "experiments/material.py", "map", "mapping", "features",
             "geometry", "recording"),
     "run": ("experiments/measure.py", "experiments/alter.py",
+            "experiments/disturbance.py", "experiments/disturbances",
             "experiments/maps.py", "experiments/material.py",
             "evaluation/ate.py", "localization", "map/store.py", "map/descriptors.py",
             "map/uncertainty.py",

@@ -77,11 +77,7 @@ def _run(job: RunJob, store: Store, data: Path) -> None:
 
     recording = store.flight(job.recording) if job.recording else None
     flight = flown(job.flight, recording, data, _lens(job, store))
-    map_ = maps.load(store.map(job.map_key))
-    if job.alter.landmarks < 1:
-        from ground_station.experiments.alter import drawn
-
-        map_ = drawn(map_, job.alter.landmarks, job.seed)
+    map_ = job.alter.map(maps.load(store.map(job.map_key)), job.seed)
     store.write(job.key, measure(map_, flight, job.alter, job.preset, job.settings, job.seed))
 
 

@@ -81,7 +81,7 @@ def _case(case: Case, plan: Plan, store: Store) -> dict[str, Any]:
         "thesis": {k: v for k, v in asdict(case.thesis).items() if v not in (None, "")},
         "map": asdict(case.map),
         "flight": asdict(case.flight),
-        "alter": asdict(case.alter),
+        "alter": dict(case.alter),
         "localizer": dict(case.localizer),
         "presets": presets,
         "common": common,

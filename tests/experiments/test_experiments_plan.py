@@ -10,6 +10,7 @@ import pytest
 
 from ground_station.errors import InputError
 from ground_station.experiments import declaration, plan
+from ground_station.experiments.alter import Alteration
 from ground_station.experiments.declaration import FLIGHT_S, IMAGES, FlightDeclaration, shortened
 from ground_station.experiments.maps import evenly
 from ground_station.experiments.plan import FlightJob, LensJob, MapJob, RunJob
@@ -72,9 +73,7 @@ def test_a_changed_setting_makes_only_what_it_touches_anew(declared):
     assert keys(first, FlightJob) == keys(second, FlightJob)
     assert not keys(first, MapJob) & keys(second, MapJob)
     assert not keys(first, RunJob) & keys(second, RunJob)
-    darker = [
-        replace(c, alter=replace(c.alter, blur_px=1.0)) for c in declared.experiments[0].cases
-    ]
+    darker = [replace(c, alter={**c.alter, "blur_px": 1.0}) for c in declared.experiments[0].cases]
     blurred = replace(declared, experiments=[replace(declared.experiments[0], cases=darker)])
     third = plan.make(blurred, MappingSettings(), Path("none"))
     assert keys(first, MapJob) == keys(third, MapJob)
@@ -195,8 +194,8 @@ def test_the_shipped_flights_are_long_enough_for_what_happens_in_them():
     short = shortened(declaration.load())
     for experiment in short.experiments:
         for case in experiment.cases:
-            end_s = case.alter.dark_from_s + case.alter.dark_s
-            assert case.flight.duration_s >= end_s + (1.0 if case.alter.dark_s else 0.0)
+            end_s = Alteration.of(case.alter, case.name).blind_until_s
+            assert end_s is None or case.flight.duration_s >= end_s + 1.0
             changes = unsteady(case.flight.exposure_steps, case.flight.light_steps)
             for steps in (changes.exposure_ev, changes.light):
                 assert all(case.flight.duration_s > at_s + 0.9 for at_s in steps.time_s[:2])

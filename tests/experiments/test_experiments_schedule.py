@@ -18,7 +18,8 @@ import pytest
 
 from ground_station.errors import GroundStationError, InputError, MapInUseError
 from ground_station.experiments import maps, schedule
-from ground_station.experiments.declaration import Alteration, FlightDeclaration, MapSpec
+from ground_station.experiments.alter import Alteration
+from ground_station.experiments.declaration import FlightDeclaration, MapSpec
 from ground_station.experiments.plan import FlightJob, LensJob, MapJob, Plan, RunJob
 from ground_station.experiments.schedule import carry_out
 from ground_station.experiments.store import Store

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ground_station.experiments import alter
+from ground_station.experiments.disturbances.landmarks import Fewer, subset
 
 
 def test_a_subset_of_all_is_all(rooms):
-    same = alter.subset(rooms, np.arange(len(rooms.landmarks)))
+    same = subset(rooms, np.arange(len(rooms.landmarks)))
     for name in ("id", "position_m", "spread", "descriptor"):
         assert np.array_equal(getattr(same.landmarks, name), getattr(rooms.landmarks, name))
     for name in ("offset", "landmark", "pixel_px"):
@@ -17,7 +17,7 @@ def test_a_subset_of_all_is_all(rooms):
 
 def test_a_subset_keeps_the_observations_of_its_landmarks(rooms):
     kept = np.arange(3, 303, 3)
-    some, kf = alter.subset(rooms, kept), rooms.keyframes
+    some, kf = subset(rooms, kept), rooms.keyframes
     assert np.array_equal(some.landmarks.id, rooms.landmarks.id[kept])
     for k in range(len(kf)):
         seen = kf.landmark[kf.offset[k] : kf.offset[k + 1]]
@@ -28,7 +28,7 @@ def test_a_subset_keeps_the_observations_of_its_landmarks(rooms):
 def test_a_share_is_drawn_by_its_seed_and_holds_the_smaller_ones(rooms):
     total = len(rooms.landmarks)
     half, quarter, again, other = (
-        alter.drawn(rooms, share, seed).landmarks.id
+        Fewer(share).map(rooms, seed).landmarks.id
         for share, seed in ((0.5, 1), (0.25, 1), (0.5, 1), (0.5, 2))
     )
     assert (len(half), len(quarter)) == (round(total / 2), round(total / 4))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from synthetic import FakeExtractor, apart, preset_with, unit
 
-from ground_station.experiments.alter import scaled_camera
+from ground_station.experiments.disturbances.scale import Scale
 from ground_station.geometry import poses
 from ground_station.localization.acquisition import Acquirer
 from ground_station.localization.attempt import Conditions, Stopwatch
@@ -208,7 +208,7 @@ def test_what_is_far_from_its_prediction_is_found_within_the_predictions_doubt(r
 def test_a_smaller_picture_is_searched_at_the_same_angle(room, preset):
     """Turned by 60 px of 640, or 30 px of 320, no landmark is found that is not one by chance."""
     _, path = room.path(1)
-    coarse = scaled_camera(room.camera, 0.5)
+    coarse = Scale(0.5).camera(room.camera)
     features = room.features(path[0])
     half = dataclasses.replace(features, keypoints_px=(features.keypoints_px + 0.5) / 2 - 0.5)
     turned = path[0] @ poses.exp([0.0, 60 / room.camera.fx_px, 0.0, 0.0, 0.0, 0.0])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from synthetic import CAMERA, FakeExtractor, preset_with
 
-from ground_station.experiments.alter import scaled_camera
+from ground_station.experiments.disturbances.scale import Scale
 from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.localization.lens import against_map, considered
@@ -39,7 +39,7 @@ def test_a_lens_that_the_maps_pictures_denied_is_put_right() -> None:
     for other, info in (
         (longer(given, 0.001), map_info("found", given)),  # another day's
         (flight, map_info("open", given)),
-        (scaled_camera(flight, 0.5), map_info("found", given)),
+        (Scale(0.5).camera(flight), map_info("found", given)),
         (flight, replace(map_info("found", given), built={})),
     ):
         assert against_map(info, other) == (other, False)
@@ -56,7 +56,7 @@ def test_the_localizer_sees_by_the_lens_that_was_found(
 
 def test_the_maps_own_lens_is_known_at_any_size() -> None:
     info = map_info("given", CAMERA)
-    for flight in (CAMERA, replace(CAMERA, readout_s=0.01), scaled_camera(CAMERA, 0.5)):
+    for flight in (CAMERA, replace(CAMERA, readout_s=0.01), Scale(0.5).camera(CAMERA)):
         assert against_map(info, flight) == (flight, True)
     assert not against_map(info, longer(CAMERA, 1e-3))[1]
 

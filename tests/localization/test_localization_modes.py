@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from synthetic import all_compared, keyframes_of, landmarks_at, unit, unit_rows
 
-from ground_station.experiments.alter import scaled_camera
+from ground_station.experiments.disturbances.scale import Scale
 from ground_station.features.extractor import Features
 from ground_station.geometry import poses
 from ground_station.localization.association import associate
@@ -184,7 +184,7 @@ def test_a_pose_is_as_significant_by_modes(room):
 
 def test_chance_finds_as_much_in_a_smaller_picture(room):
     """Features of descriptors that are all alike: what is near enough counts, and nothing else."""
-    small = scaled_camera(room.camera, 0.5)
+    small = Scale(0.5).camera(room.camera)
     alike = np.tile(room.map.landmarks.descriptor[:1], (len(room.map.landmarks), 1))
     landmarks = replace(room.map.landmarks, descriptor=alike)
     _, truth = room.path(1)

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from ground_station.errors import InputError
-from ground_station.experiments.alter import scaled_camera
+from ground_station.experiments.disturbances.scale import Scale
 from ground_station.progress import Progress
 from ground_station.recording.flight import FlightRecording, camera_of
 from ground_station.recording.frames import CAMERA_TABLE
@@ -64,7 +64,7 @@ def make(recording: Path, out: Path, size: Size = Size()) -> None:
     if camera is None:
         raise InputError(f"{recording}: it carries no camera calibration")
     # The same lens on a grid of fewer pixels.
-    coarse = scaled_camera(camera, size.width_px / camera.width_px)
+    coarse = Scale(size.width_px / camera.width_px).camera(camera)
     if (coarse.width_px, coarse.height_px) != (size.width_px, size.height_px):
         raise InputError(
             f"{camera.width_px}x{camera.height_px} px do not become"

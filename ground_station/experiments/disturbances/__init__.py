@@ -1,0 +1,1 @@
+"""What may happen to frames and maps, a file each, found by its `DISTURBANCE`."""
