@@ -700,6 +700,10 @@ def test_each_script_that_a_script_imports_is_served() -> None:
     for path in (*STATIC.rglob("*.js"), *SHARED.rglob("*.js")):
         for name in re.findall(r"""(?:from|import\() ?"\./(\w+\.js)\"""", path.read_text()):
             assert served.lookup_path(f"js/{name}")[1] is not None, f"{path}: {name}"
+    panels = re.findall(r'data-panel="(\w+)"', (STATIC / "index.html").read_text())
+    for name in panels:
+        assert "export class Panel " in (STATIC / f"js/{name}.js").read_text()
+    assert {"flight", "board", "timing", "events"} <= set(panels)
 
 
 def test_text_stands_out_from_its_ground() -> None:

@@ -9,9 +9,9 @@ const BARS_DBM = [-85, -75, -67, -58]; // one bar: barely; four: as near as it n
 const HOT_C = 80; // the Pi slows down from here on
 const LOSS_BAD = 0.02;
 
-export class Board {
-  /** @param {import("./store.js").Store} store @param {import("./loop.js").Loop} loop @param {import("./theme.js").Theme} theme */
-  constructor(store, loop, theme) {
+export class Panel {
+  /** @param {import("./types.js").Shared} shared */
+  constructor({ store, loop, theme }) {
     this.store = store;
     this.cards = { battery: byId("battery"), radio: byId("radio"), board: byId("board") };
     this.battery = fields(this.cards.battery);

@@ -8,9 +8,9 @@ const RANK = { info: 0, warning: 1, alarm: 2 };
 /** @type {Record<string, string>} */
 export const LEVEL_ICONS = { info: "info", warning: "degraded", alarm: "lost" };
 
-export class Events {
-  /** @param {import("./store.js").Store} store @param {import("./loop.js").Loop} loop */
-  constructor(store, loop) {
+export class Panel {
+  /** @param {import("./types.js").Shared} shared */
+  constructor({ store, loop }) {
     this.store = store;
     this.loop = loop;
     this.log = byId("log");

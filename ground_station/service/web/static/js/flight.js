@@ -10,9 +10,9 @@ const LOOPBACK = "this station listens on its own computer only; for the network
 const STEPS = "N, or the list above, shows the steps from payload to flight";
 const HAND_STEP_DEG = 1;
 
-export class Flight {
-  /** @param {import("./store.js").Store} store @param {import("./loop.js").Loop} loop */
-  constructor(store, loop) {
+export class Panel {
+  /** @param {import("./types.js").Shared} shared */
+  constructor({ store, loop }) {
     this.store = store;
     this.f = fields(byId("flight"));
     this.hand = byId("dial-hand");

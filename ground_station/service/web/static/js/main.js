@@ -3,13 +3,10 @@
 import { Actions } from "./actions.js";
 import { Alarms } from "./alarms.js";
 import * as api from "./api.js";
-import { Board } from "./board.js";
 import { StationClock } from "./clock.js";
 import { Connection } from "./connection.js";
 import { MapDialog, PowerDialog } from "./dialogs.js";
 import { byId, setText } from "./dom.js";
-import { Events } from "./events.js";
-import { Flight } from "./flight.js";
 import { Keyboard } from "./keyboard.js";
 import { Layout } from "./layout.js";
 import { Loop } from "./loop.js";
@@ -23,7 +20,6 @@ import { Steps } from "./steps.js";
 import { Status } from "./status.js";
 import { Store } from "./store.js";
 import { Theme } from "./theme.js";
-import { Timing } from "./timing.js";
 import { Video } from "./video.js";
 
 const TICK_MS = 250;
@@ -54,8 +50,6 @@ function choose(id) {
 const plan = new Plan(store, loop, theme);
 const scene = new Scene(store, loop, theme);
 const video = new Video(store, loop, theme, send);
-const board = new Board(store, loop, theme);
-const timing = new Timing(store, loop, theme, video);
 const alarms = new Alarms(store, loop);
 const mapDialog = new MapDialog(store);
 const powerDialog = new PowerDialog(store);
@@ -74,9 +68,16 @@ new Layout(() => {
   theme.read();
   recoloured();
 });
-new Flight(store, loop);
-new Events(store, loop);
 new Status(store, loop, choose);
+
+/**
+ * A panel is its markup in `index.html` with `data-panel`, and the module of that name.
+ * @type {{ sample?: () => void, clear?: () => void }[]}
+ */
+const panels = [];
+for (const { dataset } of /** @type {NodeListOf<HTMLElement>} */ (document.querySelectorAll("[data-panel]"))) {
+  import(`./${dataset.panel}.js`).then(({ Panel }) => panels.push(new Panel({ store, loop, theme, video })));
+}
 
 mapDialog.chosen = (name) => actions.ofPayload("map", `Map ${name}`, (id) => api.chooseMap(id, name));
 mapDialog.sent = (name) => actions.ofPayload("map", name ? `Station ${name}` : "Whichever station", (id) => api.chooseStation(id, name));
@@ -92,8 +93,7 @@ const maps = new Maps((map, problem) => {
 loop.add(["estimate", "station", "selection"], () => maps.want(store.current?.estimate?.map || store.station.map || ""), 250);
 loop.add(["selection"], () => {
   video.clear();
-  board.clear();
-  timing.clear();
+  for (const panel of panels) panel.clear?.();
 });
 
 /** @type {Record<string, (message: Record<string, any>) => void>} */
@@ -179,8 +179,7 @@ setInterval(() => {
   if (!store.isLive(store.current)) loop.mark("stale");
 }, TICK_MS);
 setInterval(() => {
-  board.sample();
-  timing.sample();
+  for (const panel of panels) panel.sample?.();
   loop.mark("sample");
 }, SAMPLE_MS);
 connection.open();

@@ -22,9 +22,9 @@ const FATES = [
 const LATENCIES = 600; // of 60 s, ten a second at most
 const TAKEN_MS = 100;
 
-export class Timing {
-  /** @param {import("./store.js").Store} store @param {import("./loop.js").Loop} loop @param {import("./theme.js").Theme} theme @param {import("./video.js").Video} video */
-  constructor(store, loop, theme, video) {
+export class Panel {
+  /** @param {import("./types.js").Shared} shared */
+  constructor({ store, loop, theme, video }) {
     this.store = store;
     this.video = video;
     this.f = fields(byId("timing"));

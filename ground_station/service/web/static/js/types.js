@@ -160,5 +160,11 @@
  * @property {boolean} done
  * @property {string} reason
  * @property {Record<string, number|string>} [values]
+ *
+ * @typedef {object} Shared what a panel is made of
+ * @property {import("./store.js").Store} store
+ * @property {import("./loop.js").Loop} loop
+ * @property {import("./theme.js").Theme} theme
+ * @property {import("./video.js").Video} video
  */
 export {};
