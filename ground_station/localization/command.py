@@ -33,9 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "none (default): found from the map alone",
     )
     parser.add_argument(
-        "--preset", default="default", choices=["default", "thesis"], help="which settings"
-    )
-    parser.add_argument("--settings", metavar="FILE.toml", help="settings instead of a preset's")
+        "--preset", default="default", metavar="NAME|FILE.toml",
+        help="settings: a preset's, or a file of your own (default)",
+    )  # fmt: skip
     parser.add_argument(
         "--min-entropy-bits", type=float, metavar="B", help="skip frames of less entropy, 0 to 8"
     )
@@ -66,13 +66,10 @@ def load_settings(args: argparse.Namespace) -> LocalizerSettings:
     from dataclasses import replace
 
     from ground_station.errors import check_options
-    from ground_station.localization.settings import LocalizerSettings, load_preset
-    from pi_firmware.wire import config
+    from ground_station.localization.settings import load_preset
 
     check_options(args, min_entropy_bits=(0, 8))
-    settings = (
-        config.load(args.settings, LocalizerSettings) if args.settings else load_preset(args.preset)
-    )
+    settings = load_preset(args.preset)
     if args.min_entropy_bits is not None:
         gate = replace(settings.gate, min_entropy_bits=args.min_entropy_bits)
         settings = replace(settings, gate=gate)
@@ -149,7 +146,7 @@ def run(args: argparse.Namespace) -> int:
             "input": str(args.input),
             "map": map_.info.name,
             "frame": map_.info.frame,
-            "preset": "" if args.settings else args.preset,
+            "preset": args.preset,
             "interrupted": interrupted,
         }
         write_json(args.json, about | summary(estimates, elapsed_s, settings))

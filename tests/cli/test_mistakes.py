@@ -48,7 +48,7 @@ blimp map
 blimp localize walk.mp4 --map atrium
     required: --out; blimp localize --help
 blimp localize walk.mp4 --map atrium --out e --preset fast
-    choose from 'default', 'thesis'
+    there is no 'fast' (known: default, thesis, or a .toml file)
 blimp localize atrium --map walk.mp4 --out e
     blimp map build walk.mp4 --out maps/NAME
 blimp localize nosuch.mp4 --map atrium --out e
