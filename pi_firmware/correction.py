@@ -124,7 +124,7 @@ def protect(frame: Sequence[bytes], corrections: int) -> Iterator[bytes]:
 class Forecast:
     """The losses to be expected that nothing else fixes; times are seconds of any one clock.
 
-    What the ground asks for again and gets is mended: how much that is, its reports tell, also
+    What the ground asks for again and gets is recovered: how much that is, its reports tell, also
     while corrections are there before.
     """
 

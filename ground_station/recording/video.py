@@ -48,15 +48,15 @@ class VideoFile:
         self.notes.clear()
         given = 0
         with self._open() as container:
-            mended = _Mended(self._rate_hz, container.format.name)
+            repair = _StampRepair(self._rate_hz, container.format.name)
             stream = container.streams.video[0]
-            for k, (time_ns, picture) in enumerate(mended.times(self._decode(container, stream))):
+            for k, (time_ns, picture) in enumerate(repair.times(self._decode(container, stream))):
                 if self._range.is_past(k):
                     break
                 if k in self._range:
                     given += 1
                     yield Frame(k, frame_name(k), time_ns, grey(picture))
-        self.notes += [f"{self.path}: {note}" for note in mended.notes()]
+        self.notes += [f"{self.path}: {note}" for note in repair.notes()]
         check_given(self.path, given, self._range)
 
     def first_picture(self) -> tuple[int, int, int]:
@@ -104,7 +104,7 @@ class VideoFile:
         return container
 
 
-class _Mended:
+class _StampRepair:
     """Times of pictures in the order of display: those of the container, later by each picture.
 
     AVI stores one time an entry in the order of decoding, so that times come permuted where
@@ -153,7 +153,7 @@ class _Mended:
         return time_ns
 
     def notes(self) -> Iterator[str]:
-        """What was mended."""
+        """What was repaired."""
         if self._untimed and not self._timed:
             rate_hz = 1e9 / self._nominal_ns
             yield f"{self._untimed} frames without a time, taken at {rate_hz:g} Hz"

@@ -32,8 +32,8 @@ class Flow:
     `received_kbps` are the payloads of its packets, each once, and of its corrections;
     `retransmitted_kbps` of them are of packets that were sent again. `queue_s` is what frames
     waited on the way, `dropped` the share of packets, 0 to 1, that were lost while others came,
-    whether or not they were mended, and `burst` how many of these in a row. `largest_bytes` is of
-    the largest packet of the last second, its header too, None for less than ten packets.
+    whether recovered or not, and `burst` how many of these in a row. `largest_bytes` is of the
+    largest packet of the last second, its header too, None for less than ten packets.
     """
 
     received_kbps: float

@@ -13,8 +13,8 @@ class Counters:
     `other_streams`, or `garbage`; where keys are asked for, also `refused` (not authentic) or
     `replayed` (authentic, but not for the first time).
     A packet that was sent came by itself (`packets` less `packets_late`, which came again or after
-    they were given up), is one of `packets_mended` (missing, asked for, and sent again in time), of
-    `packets_corrected` (missing, and found from corrections in time), or one of `packets_lost`.
+    they were given up), is one of `packets_recovered` (missing, asked for, and sent again in time),
+    of `packets_corrected` (missing, and found from corrections in time), or one of `packets_lost`.
     `packets_asked` are those that were asked for, each once.
     Every access unit of which anything arrived is one of `decoded` (as it was sent), `damaged` (in
     parts, which are known), `withheld` (nothing of it can be shown before the next IDR), `failed`
@@ -28,7 +28,7 @@ class Counters:
     packets_lost: int = 0
     packets_late: int = 0
     packets_asked: int = 0
-    packets_mended: int = 0
+    packets_recovered: int = 0
     packets_corrected: int = 0
     retransmissions: int = 0
     corrections: int = 0

@@ -60,15 +60,15 @@ class Tally:
     """Packets of one stream: those in time, each once, and those the decoder went on without.
 
     A packet that comes late was given up before and stays lost; a duplicate counts once. So both
-    together are the packets that were sent. `frames` is how many the payload says it sent, `mended`
-    those of the packets in time that had to be sent again, `corrected` those that were found, and
-    `again` what came again at all.
+    together are the packets that were sent. `frames` is how many the payload says it sent,
+    `recovered` those of the packets in time that had to be sent again, `corrected` those that were
+    found, and `again` what came again at all.
     """
 
     packets: int = 0
     lost: int = 0
     frames: int = 0
-    mended: int = 0
+    recovered: int = 0
     corrected: int = 0
     again: int = 0
 
@@ -86,9 +86,9 @@ class Tally:
 
     @property
     def share_missed(self) -> float:
-        """The same of what was lost before it was mended."""
+        """The same of what was lost before it was recovered."""
         if self.packets + self.lost:
-            missed = self.lost + self.mended + self.corrected
+            missed = self.lost + self.recovered + self.corrected
             return missed / (self.packets + self.lost)
         return self.share_lost
 
@@ -156,10 +156,10 @@ def _is_urgent(seen: Flow | messages.LinkReport | None) -> bool:
 
 
 def _tally(counters: Counters, frames: int) -> Tally:
-    mended, corrected = counters.packets_mended, counters.packets_corrected
-    in_time = counters.packets - counters.packets_late + mended + corrected
+    recovered, corrected = counters.packets_recovered, counters.packets_corrected
+    in_time = counters.packets - counters.packets_late + recovered + corrected
     again = counters.retransmissions
-    return Tally(in_time, counters.packets_lost, frames, mended, corrected, again)
+    return Tally(in_time, counters.packets_lost, frames, recovered, corrected, again)
 
 
 @dataclass
@@ -285,7 +285,7 @@ class Feedback:
             packets_lost=tally.lost,
             lost=lost,
             round_trip_s=round_trip_s,
-            packets_mended=tally.mended,
+            packets_recovered=tally.recovered,
             missed=missed,
             corrects=True,
             packets_corrected=tally.corrected,

@@ -135,7 +135,7 @@ class Reorderer:
             self._counters.retransmissions += 1
             if not self.retransmission.came(packet.sequence, packet.arrival_ns, again=True):
                 return  # nobody waits for it
-            self._counters.packets_mended += 1
+            self._counters.packets_recovered += 1
             self._held[packet.sequence] = packet
             yield from self._release(patient=True)
             return

@@ -222,8 +222,8 @@ class LinkReport(Message):
     `received_kbps`, `queue_s` and `dropped` are None where an older ground station measures none
     or has nothing to measure them by.
 
-    A packet was sent, and is one of `packets` or of `packets_lost`; `packets_mended` of the former
-    were missing, asked for again, and came in time, and `packets_corrected` were found from
+    A packet was sent, and is one of `packets` or of `packets_lost`; `packets_recovered` of the
+    former were missing, asked for again, and came in time, and `packets_corrected` were found from
     corrections. So `lost` is what is left after both, and `missed` and `dropped` are of what the
     link lost before them.
     """
@@ -242,8 +242,8 @@ class LinkReport(Message):
     received_kbps: float | None = None  # of the packets' payloads, over the last half second
     queue_s: float | None = None  # what most frames waited on the way, beyond the least of late
     dropped: float | None = None  # share of packets lost in the last second while others came
-    packets_mended: int = 0
-    missed: float | None = None  # share of packets that were lost or mended, of late
+    packets_recovered: int = 0
+    missed: float | None = None  # share of packets that were lost or recovered, of late
     retransmitted_kbps: float | None = None  # of received_kbps: packets that were sent again
     corrects: bool = False  # it takes forward correction
     packets_corrected: int = 0

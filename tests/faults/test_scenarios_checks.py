@@ -253,7 +253,7 @@ def test_impairments_of_several_steps_add_up() -> None:
     assert combined([]).loss == 0.0
 
 
-def test_a_wire_carries_is_cut_and_is_mended() -> None:
+def test_a_wire_carries_is_cut_and_is_repaired() -> None:
     with socket.create_server(("127.0.0.1", 0)) as there:
         there.settimeout(5.0)
         with TcpWire(there.getsockname()[1]) as wire:

@@ -14,7 +14,7 @@ ADAPTING = ("encoder.adapt=true",)
 """As the payload flies: bit rate and IDR interval follow what the ground reports."""
 ALONE = ("link.history_s=0", "link.assumed_loss=0.02")
 """A link that is one way: nothing is sent again, and correction does not wait for reports."""
-UNMENDED = ("link.history_s=0", "link.correction=0")
+UNRECOVERED = ("link.history_s=0", "link.correction=0")
 """A payload of 0.1."""
 BURST_PACKETS = 10.0
 """The mean length of a burst in which all packets are lost."""
@@ -101,9 +101,9 @@ AXES = (
         _link("none"), *(_link(_percent(share), loss=share) for share in _SHARES))),
     Axis("loss-one-way", "packets lost, one by one; nothing is sent again", (
         _link("none", *ALONE), *(_link(_percent(share), *ALONE, loss=share) for share in _SHARES))),
-    Axis("loss-unmended", "packets lost, one by one; nothing is sent again or corrected", (
-        _link("none", *UNMENDED),
-        *(_link(_percent(share), *UNMENDED, loss=share) for share in _SHARES))),
+    Axis("loss-unrecovered", "packets lost, one by one; nothing is sent again or corrected", (
+        _link("none", *UNRECOVERED),
+        *(_link(_percent(share), *UNRECOVERED, loss=share) for share in _SHARES))),
     Axis("bursts", f"packets lost, in bursts of {BURST_PACKETS:g}", (
         _link("none"), *(_burst(share) for share in _SHARES))),
     Axis("latency", "delay of each packet", (

@@ -69,8 +69,8 @@ def test_frames_that_never_come_hold_nothing_up() -> None:
     By the payload's settings, which are the firmware's own, nothing is sent again or corrected.
     """
     link = ProxyLink(Link(kind="proxy", seed=1, loss=0.3))
-    unmended = "link.history_s=0", "link.correction=0"
-    flown = stepped(*unmended, rig=replace(LOOPBACK, link=link)).live
+    unrecovered = "link.history_s=0", "link.correction=0"
+    flown = stepped(*unrecovered, rig=replace(LOOPBACK, link=link)).live
     accounts = flown.accounts()
     assert flown.complete and accounts["captured"] == accounts["sent"] == round(30 * FLOWN_S)
     assert accounts["received"] < accounts["sent"] / 2

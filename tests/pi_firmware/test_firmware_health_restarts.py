@@ -151,7 +151,7 @@ def test_nonsense_in_the_file_is_zero(card: Card, content: bytes) -> None:
     process = card.process()
     assert (process.process_restarts, process.board_restarts) == (0, 0)
     assert not process.claim_reboot(ending=True)
-    assert card.document["processes"] == 1, "and mended"
+    assert card.document["processes"] == 1, "and repaired"
 
 
 @pytest.mark.parametrize("value", [-1, 10**12, 2.0, True, None, "3", [], float("nan")])

@@ -131,11 +131,11 @@ class Stamped:
     time_base: Fraction = Fraction(1, 1000)
 
 
-def mended(stamps_ms: list[int | None]) -> tuple[list[float], list[str]]:
+def repaired(stamps_ms: list[int | None]) -> tuple[list[float], list[str]]:
     """Times, milliseconds, and notes of pictures with these stamps, at 25 Hz where none has one."""
-    mending = video._Mended(25.0, "matroska")
-    times = [ns / 1e6 for ns, _ in mending.times(iter([Stamped(ms) for ms in stamps_ms]))]
-    return times, list(mending.notes())
+    repair = video._StampRepair(25.0, "matroska")
+    times = [ns / 1e6 for ns, _ in repair.times(iter([Stamped(ms) for ms in stamps_ms]))]
+    return times, list(repair.notes())
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_times_that_are_missing_or_doubled_are_put_between_and_said(
     stamps_ms: list[int | None], times_ms: list[float], note: str | None
 ) -> None:
     """A frame that is not later than the one before would be refused by who localizes it."""
-    times, notes = mended(stamps_ms)
+    times, notes = repaired(stamps_ms)
     assert times == times_ms
     assert [n[: len(note or "")] for n in notes] == ([note] if note else [])
 

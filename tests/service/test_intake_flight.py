@@ -85,10 +85,10 @@ def test_lost_packets_are_accounted_for_exactly(tmp_path: Path) -> None:
         given_up = stream["packets_late"]  # later than 30 ms on a busy machine
         assert stream["packets"] + stream["retransmissions"] == link.counts.passed
         assert given_up <= stream["packets"] // 20
-        assert stream["packets_mended"] > stream["packets_lost"] - given_up
+        assert stream["packets_recovered"] > stream["packets_lost"] - given_up
         # A loss behind the last packet that came is one that nobody can see, and so is most of what
         # was sent again and lost again.
-        missed = stream["packets_lost"] - given_up + stream["packets_mended"]
+        missed = stream["packets_lost"] - given_up + stream["packets_recovered"]
         assert 0 <= link.counts.lost - missed <= 3 + 0.1 * link.counts.lost
         assert account["withheld"] == 0 or stream["packets_lost"] > 0
 

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import pytest
 from impaired_link import CLEAN, Impairment
-from mended_link import MS, RATE_HZ, Mended, fly, shown
 from numbered_flight import GOP
+from recovering_link import MS, RATE_HZ, Recovered, fly, shown
 from test_stream_retransmission import BURSTS, small_frames
 
 from ground_station.stream import rtp
@@ -28,11 +28,11 @@ IDR = range(0, 900, GOP)
 TWO_PERCENT, PAIRS = Impairment(loss=0.02), Impairment(burst_start=0.015 / 0.97, burst_end=0.5)
 
 
-def told(made: Mended) -> int:
+def told(made: Recovered) -> int:
     """The packets that were sent, by what became of them: each is one of four things."""
     counters = made.counters
     came = counters.packets - counters.packets_late
-    return came + counters.packets_mended + counters.packets_corrected + counters.packets_lost
+    return came + counters.packets_recovered + counters.packets_corrected + counters.packets_lost
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_an_older_ground_station_is_sent_none() -> None:
 def test_a_long_round_trip_is_told_by_what_comes_too_late() -> None:
     made = fly(small_frames(900), TWO_PERCENT, seed=4, round_trip_ms=200, corrected=True)
     assert len(shown(made, IDR)) >= 0.96 * 900
-    assert made.counters.packets_mended == 0
+    assert made.counters.packets_recovered == 0
 
 
 def test_both_together_mend_a_tenth() -> None:
@@ -80,7 +80,7 @@ def test_both_together_mend_a_tenth() -> None:
     made = fly(small_frames(900), does, seed=4, round_trip_ms=30, corrected=True)
     counters = made.counters
     assert len(shown(made, IDR)) >= 0.97 * 900
-    assert counters.packets_corrected > 0 and counters.packets_mended > 0
+    assert counters.packets_corrected > 0 and counters.packets_recovered > 0
 
 
 def test_bursts_that_no_correction_of_a_frame_outlasts_are_given_up() -> None:
@@ -232,7 +232,9 @@ def test_a_quick_return_takes_over_from_corrections_that_were_there_before() -> 
     report = LinkReport(1, "main", 5600, corrects=True, dropped=0.1, burst=1.0, packets_lost=18)
     forecast.report(report, 0.0)
     assert forecast.loss == pytest.approx(0.1)
-    for second in range(1, 6):  # corrections leave nothing to be mended, and still it is answered
+    for second in range(
+        1, 6
+    ):  # corrections leave nothing to be recovered, and still it is answered
         forecast.report(replace(report, answered=5 * second), float(second))
     assert forecast.loss < 0.01
 

@@ -63,11 +63,11 @@ def test_what_was_mended_is_not_lost_but_was_missed() -> None:
     # Of 100 sent 15 did not come by themselves: 7 were sent again in time, 5 were found, 3 given
     # up, of which one came late.
     came = Counters(
-        packets=86, packets_late=1, packets_lost=3, packets_asked=10, packets_mended=7,
+        packets=86, packets_late=1, packets_lost=3, packets_asked=10, packets_recovered=7,
         packets_corrected=5,
     )  # fmt: skip
     tally, lost = account.add(7, came, 20, 1.0)
-    assert (tally.packets, tally.mended, tally.corrected, tally.lost) == (97, 7, 5, 3)
+    assert (tally.packets, tally.recovered, tally.corrected, tally.lost) == (97, 7, 5, 3)
     assert lost == pytest.approx(0.03) and account.late.share_missed == pytest.approx(0.15)
 
 
@@ -170,18 +170,18 @@ def test_each_living_payload_hears_of_its_own_stream(listener: TelemetryListener
         ear.close()
 
 
-def test_a_stream_hears_what_its_payload_mends_it_with_and_reports_what_that_mended(
+def test_a_stream_hears_what_its_payload_mends_it_with_and_reports_what_that_recovered(
     listener: TelemetryListener,
 ) -> None:
     ear = Ear(listener, "one")
     counters = Counters(
-        packets=92, packets_lost=1, packets_mended=4, packets_corrected=3, retransmissions=6
+        packets=92, packets_lost=1, packets_recovered=4, packets_corrected=3, retransmissions=6
     )
     video = Video(5601, 11, counters, Flow(900.0, 0.0, 0.05, 40.0, 1.5))
     ear.telemetry.publish(gate(10, 11))
     assert listener.wait("one", lambda s: s.alive and s.ssrc is not None, LIMIT_S)
     with Feedback(listener, lambda _: video, period_s=0.05):
-        told = ear.wait(lambda report: report.packets_mended == 4)
+        told = ear.wait(lambda report: report.packets_recovered == 4)
         assert told is not None and told.missed is not None
         assert (told.packets, told.packets_lost, told.retransmitted_kbps) == (99, 1, 40.0)
         assert told.corrects and (told.packets_corrected, told.answered, told.burst) == (3, 6, 1.5)

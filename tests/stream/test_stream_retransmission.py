@@ -7,10 +7,10 @@ import struct
 
 import pytest
 from impaired_link import CLEAN, Impairment
-from mended_link import MS, RATE_HZ, fly, sent_again, shown
 from numbered_flight import (
     GOP,
 )
+from recovering_link import MS, RATE_HZ, fly, sent_again, shown
 
 from ground_station.stream import rtp
 from ground_station.stream.counters import Counters
@@ -141,9 +141,9 @@ def test_a_lossy_link_shows_nearly_all_frames(
     # Each packet that was sent is one of three things; the last ones' loss is never noticed.
     counters, sent = made.counters, sum(map(len, frames))
     came = counters.packets - counters.packets_late
-    told = came + counters.packets_mended + counters.packets_lost
+    told = came + counters.packets_recovered + counters.packets_lost
     assert sent - 60 <= told <= sent
-    assert counters.packets_mended <= counters.packets_asked
+    assert counters.packets_recovered <= counters.packets_asked
     delays_ms = sorted(
         at_ms - 1000 * int.from_bytes(unit.data[-4:], "big") // RATE_HZ
         for at_ms, unit in made.units
@@ -175,7 +175,7 @@ def test_a_long_silence_is_not_asked_for_but_a_little_after_one_is() -> None:
     # A frame's end, missed with the next one a second later.
     rare = [frame for frame in frames[:20] for frame in (frame, *([[]] * 29))]
     made = fly(rare, CLEAN, history_ms=1500, drop={6 * 8 - 1})
-    assert made.counters.packets_lost == 0 and made.counters.packets_mended == made.nacks == 1
+    assert made.counters.packets_lost == 0 and made.counters.packets_recovered == made.nacks == 1
 
 
 def test_a_retransmission_that_nobody_waits_for_changes_nothing() -> None:
@@ -192,7 +192,11 @@ def test_a_retransmission_that_nobody_waits_for_changes_nothing() -> None:
     far = rtp.parse(sent_again(frames[1][3]), 0)
     assert far is not None and [*reorderer.push(far)] == []
     assert len(ready) == 6 and not any(gap for _, gap in ready)
-    assert (counters.retransmissions, counters.packets_mended, counters.packets_late) == (7, 0, 0)
+    assert (counters.retransmissions, counters.packets_recovered, counters.packets_late) == (
+        7,
+        0,
+        0,
+    )
 
 
 def test_a_reordered_packet_is_received_and_what_came_again_is_not_counted_twice() -> None:
@@ -208,7 +212,7 @@ def test_a_reordered_packet_is_received_and_what_came_again_is_not_counted_twice
         taken += reorderer.push(packet)
         reorderer.retransmission.due(0)
     assert [packet.sequence for packet, _ in taken] == [*range(65_000, 65_006)]
-    assert counters.packets_asked == 1 and counters.packets_mended == counters.packets_late == 0
+    assert counters.packets_asked == 1 and counters.packets_recovered == counters.packets_late == 0
 
 
 def test_however_much_is_missing_one_datagram_asks_for_it() -> None:

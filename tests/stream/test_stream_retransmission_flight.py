@@ -14,7 +14,6 @@ from dataclasses import replace
 
 import pytest
 from impaired_link import CLEAN, ImpairedLink, Impairment
-from mended_link import sent_again
 from numbered_flight import (
     GOP,
     capture_ns,
@@ -24,6 +23,7 @@ from numbered_flight import (
     stamped,
     start_payload,
 )
+from recovering_link import sent_again
 from waiting import eventually
 
 from ground_station.stream import rtp
@@ -117,8 +117,8 @@ def test_the_payloads_own_link_sends_again_what_was_lost() -> None:
         eventually(lambda: flown.frames[-1].sequence == 94)
         counters = flown.stream.counters
         # A machine that is busy with other things answers some of it too late.
-        assert counters.packets_mended >= 0.7 * flown.air.counts.lost > 10
-        assert counters.packets_mended + counters.packets_lost >= counters.packets_asked
+        assert counters.packets_recovered >= 0.7 * flown.air.counts.lost > 10
+        assert counters.packets_recovered + counters.packets_lost >= counters.packets_asked
         assert len(numbers(flown.frames)) == 95 - counters.withheld >= 70
         assert counters.withheld == 0 or counters.packets_lost > 0
         assert flown.receiver.counters.refused == flown.receiver.counters.other_streams == 0
@@ -310,7 +310,7 @@ def test_a_flight_over_a_lossy_link_shows_nearly_all_of_its_frames(way: str) -> 
         return
     assert state.health.rtx_ssrc == stream.rtx_ssrc is not None
     assert stream.correction_ssrc is None and len(late) >= 0.95 * (30 * seconds - 60)
-    assert counters.packets_mended > 0.5 * link.lost
+    assert counters.packets_recovered > 0.5 * link.lost
     assert counters.packets_lost <= 0.5 * link.lost
 
 

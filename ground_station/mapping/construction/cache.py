@@ -246,7 +246,7 @@ class Cache:
             try:
                 return work(self._db)
             except sqlite3.Error as error:
-                self._mend(error)
+                self._start_again(error)
         return None
 
     def _open(self) -> None:
@@ -261,7 +261,7 @@ class Cache:
                 self._db = _connect(self._path)
             self._inode = self._path.stat().st_ino
 
-    def _mend(self, error: sqlite3.Error) -> None:
+    def _start_again(self, error: sqlite3.Error) -> None:
         """Begins a damaged file again; of anything else there is no more cache."""
         if self._db is not None:
             with contextlib.suppress(sqlite3.Error):

@@ -183,13 +183,13 @@ def _check_agrees(found: _Start, time_ns: I64, trajectory: Trajectory, seed: int
     if not hint:
         hint = agreement.late(found.used.source, time_ns[found.alike], trajectory)
     if reason and not hint:
-        for words, mended in agreement.mistakes(truth):
-            if np.array_equal(mended[:, :3, 3], truth[:, :3, 3]) and not found.on_line:
-                offset = _offset(found.used, found.fit, found.scatter_m, model, mended, seed)
-                other = replace(found, offset=offset, truth=mended)
+        for words, corrected in agreement.mistakes(truth):
+            if np.array_equal(corrected[:, :3, 3], truth[:, :3, 3]) and not found.on_line:
+                offset = _offset(found.used, found.fit, found.scatter_m, model, corrected, seed)
+                other = replace(found, offset=offset, truth=corrected)
             else:
                 try:
-                    other = _start(model, mended, seed)
+                    other = _start(model, corrected, seed)
                 except MapError:
                     continue
             if not agreement.disagreement(other):

@@ -236,7 +236,7 @@ def test_what_is_wrong_is_refused_and_the_old_stays_in_force(
     outcome = fresh.boots()
     assert outcome.state == "refused" and outcome.payload_id == ""
     assert told in outcome.reason and "\n" not in outcome.reason and PASSWORD not in outcome.reason
-    assert fresh.state() == before  # the person's files, too: to be mended there
+    assert fresh.state() == before  # the person's files, too: to be repaired there
 
     person.gives(renamed("gym", "first password"), keys=certificates(mark="0"))
     person.boots()

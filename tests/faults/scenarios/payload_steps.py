@@ -35,7 +35,7 @@ _NOISE_BYTES = 200
 
 @dataclass(frozen=True)
 class PayloadKilled(Step):
-    """SIGKILL, as when the supply's contact is lost; it starts again when that is mended."""
+    """SIGKILL, as when the supply's contact is lost; it starts again when that is repaired."""
 
     STARTS: ClassVar[bool] = True
 

@@ -151,7 +151,7 @@ def _end(world: World, step: Step, *, alone: bool) -> None:
 
     if alone:
         _do(world, "", look)
-    _do(world, f"mended: {type(step).__name__}" if step.for_s else "", step.fix)
+    _do(world, f"repaired: {type(step).__name__}" if step.for_s else "", step.fix)
 
 
 def _do(world: World, text: str, what: Callable[[World], None]) -> None:
@@ -160,7 +160,7 @@ def _do(world: World, text: str, what: Callable[[World], None]) -> None:
     try:
         what(world)
     except Exception as error:
-        world.complain(f"{text or 'mending'}: {type(error).__name__}: {str(error)[:300]}")
+        world.complain(f"{text or 'repairing'}: {type(error).__name__}: {str(error)[:300]}")
 
 
 def recovery(world: World, since_s: float, bound_s: float) -> Back:

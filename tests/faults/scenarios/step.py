@@ -38,7 +38,7 @@ class Step:
 
     @property
     def until_s(self) -> float:
-        """When it is mended."""
+        """When it is repaired."""
         return self.at_s + self.for_s
 
     def inject(self, world: World) -> None:
@@ -46,7 +46,7 @@ class Step:
         raise NotImplementedError
 
     def lacking(self, world: World) -> str:
-        """What of the fault cannot be seen at its end, before it is mended; '' where it was one."""
+        """What of the fault cannot be seen at its end, before its repair; '' where it was one."""
         raise NotImplementedError
 
     def fix(self, world: World) -> None:
@@ -80,7 +80,7 @@ class Scenario:
 
     @property
     def until_s(self) -> float:
-        """When the last fault is mended."""
+        """When the last fault is repaired."""
         return max((step.until_s for step in self.steps), default=0.0)
 
     @property

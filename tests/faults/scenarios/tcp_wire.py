@@ -14,7 +14,7 @@ class TcpWire:
     """Relays connections from its own loopback `port` to another; a context manager.
 
     Cut, all connections are reset and none is taken. Blocked, they stay and nothing comes through:
-    it waits, as on a radio out of reach. It is a cable again when all have mended what they did.
+    it waits, as on a radio out of reach. It is a cable again when all have repaired what they did.
     """
 
     def __init__(self, to_port: int) -> None:

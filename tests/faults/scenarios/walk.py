@@ -60,7 +60,7 @@ DRAWS: tuple[Draw, ...] = (
 
 
 def drawn(seed: int, duration_s: float = WALK_S) -> Scenario:
-    """The walk of a seed: the same steps each time, all of them mended within the duration."""
+    """The walk of a seed: the same steps each time, all of them repaired within the duration."""
     draw = random.Random(seed)
     steps = []
     for _ in range(max(2, round(duration_s / _EVERY_S))):

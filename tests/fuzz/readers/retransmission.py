@@ -55,8 +55,8 @@ def fuzz(data: bytes) -> None:
         assert len(retransmission._missing) <= 256 and len(retransmission._ambiguous) <= 256
         assert len(rtcp.nack(1, 7, asked)) <= 1100
         sequence = (sequence + (not how & 8)) & 0xFFFF
-    assert given <= taken and counters.packets_mended <= counters.packets_asked
-    assert counters.packets_mended <= counters.retransmissions
+    assert given <= taken and counters.packets_recovered <= counters.packets_asked
+    assert counters.packets_recovered <= counters.retransmissions
     for _ in range(3):
         now_ns += LIVE_NS + _MS
         retransmission.due(now_ns)
@@ -70,7 +70,7 @@ def sent(how: int, *more: bytes) -> bytes:
 
 
 def seeds() -> list[bytes]:
-    """In order; with a hole that is mended; one that is not; again unasked; far off; floods."""
+    """In order; with a hole that is recovered; one that is not; again unasked; far off; floods."""
     one, hole = sent(0), sent(2, b"\2\0")
     return [
         one * 5,

@@ -240,8 +240,8 @@ def test_in_parts_a_campus_is_whole_and_as_true_as_in_one(hall, tmp_path, monkey
     assert again.sizes == [IMAGES]
     monkeypatch.undo()
     (tmp_path / "parts/parts/0001.npz").write_bytes(b"half")
-    mended = reconstruct(images, pairs, CAMERA, SETTINGS, 2, tmp_path / "parts", Threads(2))
-    one, other = (colmap.to_arrays(each.reconstruction) for each in (again, mended))
+    repaired = reconstruct(images, pairs, CAMERA, SETTINGS, 2, tmp_path / "parts", Threads(2))
+    one, other = (colmap.to_arrays(each.reconstruction) for each in (again, repaired))
     assert np.array_equal(one.point, other.point) and np.array_equal(one.image, other.image)
 
 

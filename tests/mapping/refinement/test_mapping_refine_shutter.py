@@ -40,8 +40,8 @@ def test_a_moving_frames_pixels_go_where_a_global_shutter_saw_them(world):
     )
     exact = camera.undistort_to_pinhole(camera.project(local))
     off = np.linalg.norm(camera.undistort_to_pinhole(rolling) - exact, axis=1)
-    mended = np.linalg.norm(camera.undistort_to_pinhole(rolling) - shift - exact, axis=1)
-    assert off.max() > 1.0 and mended.max() < 0.05
+    corrected = np.linalg.norm(camera.undistort_to_pinhole(rolling) - shift - exact, axis=1)
+    assert off.max() > 1.0 and corrected.max() < 0.05
 
 
 def test_a_maps_own_shutter_is_undone_once_and_not_where_there_was_none(world):

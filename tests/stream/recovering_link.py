@@ -43,7 +43,7 @@ class Loss:
 
 
 @dataclass
-class Mended:
+class Recovered:
     """What came out: access units with when, ms; the receiver's counters; datagrams by kind."""
 
     units: list[tuple[int, AccessUnit]] = field(default_factory=list)
@@ -67,13 +67,13 @@ def fly(
     drop: Collection[int] = (),
     corrected: bool = False,
     link: LinkSettings = LinkSettings(),  # noqa: B008  # frozen
-) -> Mended:
+) -> Recovered:
     """Sends a frame's datagrams each 1/30 s; `offered`: what is missing is asked for.
 
     `corrected`: the ground takes corrections, of which those follow that the `link` has made.
     `drop` are those, in their order, that are lost besides the first time.
     """
-    made = Mended()
+    made = Recovered()
     counters = made.counters
     reorderer = rtp.Reorderer(counters)
     depacketizer, retransmission = rtp.Depacketizer(counters), reorderer.retransmission
@@ -164,7 +164,7 @@ def sent_again(datagram: bytes, ssrc: int = 99, number: int = 0) -> bytes:
     return head + datagram[4:8] + ssrc.to_bytes(4, "big") + datagram[2:4] + datagram[12:]
 
 
-def shown(made: Mended, idr: Sequence[int]) -> list[int]:
+def shown(made: Recovered, idr: Sequence[int]) -> list[int]:
     """Of frames numbered by the order of their units: those that a decoder may show.
 
     `idr` says which frames are IDRs; after a loss nothing is shown up to the next one.
@@ -172,7 +172,7 @@ def shown(made: Mended, idr: Sequence[int]) -> list[int]:
     return [*_shown(made, frozenset(idr))]
 
 
-def _shown(made: Mended, idr: frozenset[int]) -> Iterator[int]:
+def _shown(made: Recovered, idr: frozenset[int]) -> Iterator[int]:
     trusted = False
     for _, unit in made.units:
         if unit.missing_before or not unit.complete:
