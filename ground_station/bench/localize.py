@@ -37,11 +37,10 @@ def add_arguments(localize: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measures, prints the tables; raises `InputError` for a value out of range."""
-    from ground_station.bench import steps
+    from ground_station.bench import growth, steps
     from ground_station.bench.machine import machine
     from ground_station.errors import InputError, check_options
     from ground_station.files import write_json
-    from ground_station.localization import growth
     from ground_station.map import store
 
     check_options(args, frames=(2, 10**6), repetitions=(3, 10**6), seed=(0, 2**32 - 1))

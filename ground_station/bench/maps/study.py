@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from ground_station.arrays import F64
+from ground_station.bench.maps import plain
 from ground_station.errors import GeometryError, InputError
 from ground_station.geometry import poses
 from ground_station.geometry.alignment import align
@@ -19,7 +20,7 @@ from ground_station.geometry.camera import Camera, load_camera
 from ground_station.geometry.trajectory import Trajectory, read_tum
 from ground_station.mapping.construction.build import build_map
 from ground_station.mapping.settings import MappingSettings, with_changes
-from ground_station.mapping.sfm import plain, robust_similarity
+from ground_station.mapping.sfm import robust_similarity
 from ground_station.presentation.text import columns
 from ground_station.progress import Progress
 from ground_station.recording.flight import trajectory_of
