@@ -18,7 +18,7 @@ from ground_station.arrays import Bools
 from ground_station.service.bus_messages import FrameMessage
 from pi_firmware.wire import annexb
 
-SLOTS = 8
+SLOTS = 16
 _HEADER_BYTES, _STAMP_BYTES = 64, 64  # so that stamps lie apart from the pictures, and aligned
 
 

@@ -10,10 +10,10 @@ T = TypeVar("T")
 
 
 class Newest(Generic[T]):
-    """Keeps up to `most` items in their order; where there is no room, the newest only.
+    """Keeps up to `most` items in their order; where there is no room, the newer half of them.
 
-    So a moment's delay loses none, and whoever stays behind is not late for ever. From any thread;
-    `skipped` counts those that nobody took.
+    So a moment's delay loses none, a longer one few, and whoever stays behind is never later than
+    that. From any thread; `skipped` counts those that nobody took.
     """
 
     def __init__(self, most: int = 1) -> None:
@@ -26,10 +26,17 @@ class Newest(Generic[T]):
         """Takes one."""
         with self._there:
             if len(self._items) >= self._most:
-                self.skipped += len(self._items)
-                self._items.clear()
+                for _ in range(len(self._items) - self._most // 2):
+                    self._items.popleft()
+                    self.skipped += 1
             self._items.append(item)
             self._there.notify()
+
+    @property
+    def last(self) -> T | None:
+        """The newest that nobody took yet."""
+        with self._there:
+            return self._items[-1] if self._items else None
 
     def take(self, timeout_s: float) -> T | None:
         """The oldest that is kept; None when none comes in time."""

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from ground_station.service.localizing.process import FIRST_REST_S, RARE_S, Overload
+from ground_station.service.localizing.process import BEHIND_S, FIRST_REST_S, RARE_S, Overload
 
 
 @pytest.fixture
@@ -59,6 +59,16 @@ def test_keyframes_that_rest_are_said_while_frames_are_skipped_now_and_then(loca
     assert said[29] == said[-1] == "" and localizer.rest_s > RARE_S
 
 
+def test_frames_that_are_late_again_make_keyframes_rare_before_any_is_skipped(localizer):
+    overload, rests = Overload(), []
+    for k in range(20 * 30):
+        late = k in (*range(90, 96), *range(150, 156))
+        overload.watch(localizer, k / 30, k + 1, 0, BEHIND_S if late else 0.0)
+        rests.append(localizer.rest_s)
+    assert rests[149] == 0.0 and rests[150] == FIRST_REST_S == max(rests)
+    assert 0 < rests[-1] < 0.5
+
+
 def test_late_features_alone_are_said_and_shed_nothing(localizer):
     localizer.keyframe_late_s = 1.4
     said = fly(Overload(), localizer, 1, 60)
@@ -74,7 +84,7 @@ def test_keyframes_take_what_the_frames_leave(localizer, cores):
     for k in range(60 * 30):
         now_s = k / 30
         behind_s = max(0.0, behind_s - cores / 30)
-        if behind_s > 4 / 30:
+        if behind_s > 8 / 30:
             skipped += 1
             late += now_s > 10
             continue
@@ -82,6 +92,6 @@ def test_keyframes_take_what_the_frames_leave(localizer, cores):
         behind_s += 0.5 / 30
         if now_s - keyframe_s >= max(0.3, localizer.rest_s):
             behind_s, keyframe_s, keyframes = behind_s + 0.1, now_s, keyframes + 1
-        overload.watch(localizer, now_s, taken, skipped)
+        overload.watch(localizer, now_s, taken, skipped, behind_s)
     assert late <= 0.02 * 50 * 30
     assert keyframes >= 0.5 * min(60 / 0.3, 60 * (cores - 0.5) / 0.1)

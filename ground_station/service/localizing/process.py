@@ -45,27 +45,33 @@ _EFFECT_S = 0.5
 """What a longer rest saves shows after this."""
 _HALVED_S = 8.0
 """In this a rest that is too long shrinks by half: slower than it grows, so that few frames pay."""
+BEHIND_S = 0.12
+"""A frame so far behind the newest is late: four frames at 30 Hz."""
 _AGAIN_S = 5.0
-"""A frame that is skipped so long after the one before is an accident, and keyframes that rest
-still are no news."""
+"""A frame that is late or skipped so long after the one before is an accident, and keyframes that
+rest still are no news."""
 
 
 class Overload:
     """Whether frames are skipped, or features late, for lack of processor; its state in words.
 
-    Frames that are skipped again and again double the rest between two keyframes, whose features
-    cost as much as all else, and time without shortens it: what is left of the processor is found
-    as TCP finds a link's.
+    Frames that are late or skipped again and again double the rest between two keyframes, whose
+    features cost as much as all else, and time without shortens it: what is left of the processor
+    is found as TCP finds a link's. Late ones tell it before any is skipped.
     """
 
     def __init__(self) -> None:
         self._counts: deque[tuple[float, int, int]] = deque()
-        self._skipped_s = self._lengthened_s = float("-inf")
+        self._late_s = self._lengthened_s = float("-inf")
+        self._is_late = False
 
-    def watch(self, localizer: Localizer, now_s: float, taken: int, skipped: int) -> str:
+    def watch(
+        self, localizer: Localizer, now_s: float, taken: int, skipped: int, behind_s: float = 0.0
+    ) -> str:
         """After each frame; the localizer is told, and the answer is "" while all is well.
 
-        `now_s` is monotonic; `taken` and `skipped` count the stream's frames so far.
+        `now_s` is monotonic; `taken` and `skipped` count the stream's frames so far, and the newest
+        that came was taken `behind_s` after this one.
         """
         counts = self._counts
         if counts and taken + skipped < counts[-1][1] + counts[-1][2]:
@@ -77,9 +83,10 @@ class Overload:
         lost = skipped - counts[0][2]
         told = lost + taken - counts[0][1]
         rest_s = localizer.rest_s * 0.5 ** ((now_s - last_s) / _HALVED_S)
-        if skipped > last_skipped:
-            again = now_s < self._skipped_s + _AGAIN_S
-            self._skipped_s = now_s
+        was_late, self._is_late = self._is_late, behind_s >= BEHIND_S
+        if skipped > last_skipped or (self._is_late and not was_late):
+            again = now_s < self._late_s + _AGAIN_S
+            self._late_s = now_s
             if again and now_s >= self._lengthened_s + _EFFECT_S:
                 self._lengthened_s = now_s
                 rest_s = min(max(FIRST_REST_S, 2 * rest_s), LONGEST_REST_S)
@@ -143,8 +150,9 @@ RESTART = 3
 """Exit status: only a new process can help."""
 
 _POLL_S = 0.2
-_QUEUED = 4
-"""Frames that wait while one takes longer, as when a keyframe lands: 0.1 s at 30 Hz."""
+_QUEUED, _OLDEST_S = 8, 0.4
+"""Frames that wait while one takes longer, as when a keyframe is described, and how far one that is
+taken may be behind the newest: a quarter of a second at 30 Hz, four frames at 10."""
 _ANSWER_S = 3.0
 """A question for a map waits this long for it to be loaded; a larger one is told by an event."""
 _WAITING_EVERY_S = 1.0
@@ -200,12 +208,20 @@ class Localizing:
             self._accounting.skip()
             self._tell_waiting(note)
             return
-        image = self._pictures.read(note.slot, note.stamp)
-        if image is None:  # overwritten before it was read
+        stale = not self._run.stepped and self._behind_s(note) > _OLDEST_S
+        image = None if stale else self._pictures.read(note.slot, note.stamp)
+        if image is None:  # or it was overwritten before it was read
             self._accounting.skip()
             return
         self._follow_stream(self._localizer, note)
         self._localize(self._localizer, note, image)
+
+    def _behind_s(self, note: FrameMessage) -> float:
+        """How much later the newest frame that waits was taken; 0 where none waits."""
+        last = self._newest.last
+        return (
+            0.0 if last is None or last.ssrc != note.ssrc else (last.time_ns - note.time_ns) / 1e9
+        )
 
     def _follow_stream(self, localizer: Localizer, note: FrameMessage) -> None:
         """Begins again where another stream does: the payload was restarted, or its replay was."""
@@ -244,7 +260,7 @@ class Localizing:
             state = State.INITIALIZING if fresh else State.LOST
             told = derive.unsolved_note(note, state, reason, *about)
         said = self._overload.watch(
-            localizer, time.monotonic(), accounts.processed, accounts.skipped
+            localizer, time.monotonic(), accounts.processed, accounts.skipped, self._behind_s(note)
         )
         share = 0.0 if damaged is None else round(float(damaged.mean()), 3)
         told = replace(told, overload=said, damaged=share, coordinates=self._coordinates)
