@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import resource
 import time
@@ -122,9 +123,16 @@ class Bus:
         key = f"station/{kind}/{payload_id}"
         self._declared.append(self._session.declare_subscriber(key, received))
 
-    def newest(self, kind: str, of: type[N], payload_id: str = "*", most: int = 1) -> Newest[N]:
+    def newest(
+        self,
+        kind: str,
+        of: type[N],
+        payload_id: str = "*",
+        most: int = 1,
+        oldest_s: float = math.inf,
+    ) -> Newest[N]:
         """Where up to `most` messages of a kind wait; see `Newest` for what is let go of."""
-        newest: Newest[N] = Newest(most)
+        newest: Newest[N] = Newest(most, oldest_s)
         self.subscribe(kind, of, lambda _, message: newest.put(message), payload_id)
         return newest
 

@@ -170,8 +170,8 @@ def render(document: dict[str, Any]) -> str:
     others = [axis["others_cores_most"] or 0.0 for axis in document["axes"].values()]
     model = str(machine["model"]).replace("|", "/")
     said = (
-        f"Borne is the highest level at which at least {100 * document['borne_from']:g} % of the"
-        f" captured frames are TRACKING in each of {len(seeds)} runs of"
+        f"Sustained is the highest level at which at least {100 * document['borne_from']:g} %"
+        f" of the captured frames are TRACKING in each of {len(seeds)} runs of"
         f" {document['duration_s']:g} s, counted from the first TRACKING one, and at all easier"
         " levels that were tried; a level is given up at the first run that falls short. Measured"
         f" by `make limits` with a simulated flight ({document['flight'].split(',')[0]}) on"

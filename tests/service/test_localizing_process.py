@@ -40,7 +40,6 @@ from ground_station.service.localizing import __main__ as main
 from ground_station.service.localizing import maps
 from ground_station.service.localizing.process import RESTART, Localizing
 from ground_station.service.pictures import SLOTS
-from ground_station.stream.newest import Newest
 
 FLIGHT = SAMPLE / "flight.mcap"
 TRUTH = trajectory_of(FLIGHT)
@@ -395,30 +394,6 @@ def test_failures_are_counted_and_ten_in_a_row_end_it(
             eventually(lambda: bool(ended), what="the end")
             eventually(lambda: told.event("localizer-failed") is not None, what="the event")
     assert ended == ([RESTART] if times == 10 else [0])
-
-
-def test_frames_far_behind_the_newest_are_skipped(
-    tmp_path: Path, flight: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    arrived, go = list[Any](), threading.Event()
-    put, process = Newest.put, Localizer.process
-
-    def held(self: Localizer, time_ns: int, *rest: Any) -> Any:
-        assert go.wait(LIMIT_S)
-        return process(self, time_ns, *rest)
-
-    monkeypatch.setattr(Newest, "put", lambda self, item: (put(self, item), arrived.append(item)))
-    monkeypatch.setattr(Localizer, "process", held)
-    with Station(tmp_path) as told, in_a_thread(told):
-        eventually(lambda: told.event("map-loaded") is not None, what="the map")
-        told.show(flight[0].image, 0, flight[0].time_ns)
-        for n, behind_s in enumerate((1.0, 0.7, 0.1, 0.0), 1):
-            told.show(flight[n].image, n, flight[9].time_ns - round(behind_s * 1e9))
-        eventually(lambda: len(arrived) == 5, what="the last one")
-        go.set()
-        eventually(lambda: told.estimates and told.estimates[-1].sequence == 4, what="its estimate")
-    assert [estimate.sequence for estimate in told.estimates] == [0, 3, 4]
-    assert (told.estimates[-1].processed, told.estimates[-1].skipped) == (3, 2)
 
 
 def test_a_localizer_that_is_killed_is_counted_on_and_another_session_anew(

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from ground_station.service.localizing.process import BEHIND_S, FIRST_REST_S, RARE_S, Overload
+from ground_station.service.localizing.process import FIRST_REST_S, RARE_S, WAITING_S, Overload
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def test_frames_that_are_late_again_make_keyframes_rare_before_any_is_skipped(lo
     overload, rests = Overload(), []
     for k in range(20 * 30):
         late = k in (*range(90, 96), *range(150, 156))
-        overload.watch(localizer, k / 30, k + 1, 0, BEHIND_S if late else 0.0)
+        overload.watch(localizer, k / 30, k + 1, 0, WAITING_S if late else 0.0)
         rests.append(localizer.rest_s)
     assert rests[149] == 0.0 and rests[150] == FIRST_REST_S == max(rests)
     assert 0 < rests[-1] < 0.5

@@ -6,6 +6,7 @@ Of a payload that waits for poses (`Run.stepped`) each frame is taken in its tur
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 import threading
 import time
@@ -45,8 +46,8 @@ _EFFECT_S = 0.5
 """What a longer rest saves shows after this."""
 _HALVED_S = 8.0
 """In this a rest that is too long shrinks by half: slower than it grows, so that few frames pay."""
-BEHIND_S = 0.12
-"""A frame so far behind the newest is late: four frames at 30 Hz."""
+WAITING_S = 0.12
+"""A frame that waits so long is late: four frames wait at 30 Hz."""
 _AGAIN_S = 5.0
 """A frame that is late or skipped so long after the one before is an accident, and keyframes that
 rest still are no news."""
@@ -66,12 +67,12 @@ class Overload:
         self._is_late = False
 
     def watch(
-        self, localizer: Localizer, now_s: float, taken: int, skipped: int, behind_s: float = 0.0
+        self, localizer: Localizer, now_s: float, taken: int, skipped: int, waiting_s: float = 0.0
     ) -> str:
         """After each frame; the localizer is told, and the answer is "" while all is well.
 
-        `now_s` is monotonic; `taken` and `skipped` count the stream's frames so far, and the newest
-        that came was taken `behind_s` after this one.
+        `now_s` is monotonic; `taken` and `skipped` count the stream's frames so far, and the next
+        one has waited for `waiting_s`.
         """
         counts = self._counts
         if counts and taken + skipped < counts[-1][1] + counts[-1][2]:
@@ -83,7 +84,7 @@ class Overload:
         lost = skipped - counts[0][2]
         told = lost + taken - counts[0][1]
         rest_s = localizer.rest_s * 0.5 ** ((now_s - last_s) / _HALVED_S)
-        was_late, self._is_late = self._is_late, behind_s >= BEHIND_S
+        was_late, self._is_late = self._is_late, waiting_s >= WAITING_S
         if skipped > last_skipped or (self._is_late and not was_late):
             again = now_s < self._late_s + _AGAIN_S
             self._late_s = now_s
@@ -151,8 +152,8 @@ RESTART = 3
 
 _POLL_S = 0.2
 _QUEUED, _OLDEST_S = 8, 0.4
-"""Frames that wait while one takes longer, as when a keyframe is described, and how far one that is
-taken may be behind the newest: a quarter of a second at 30 Hz, four frames at 10."""
+"""Frames that wait while one takes longer, as when a keyframe is described, and for how long: a
+quarter of a second at 30 Hz, four frames at 10."""
 _ANSWER_S = 3.0
 """A question for a map waits this long for it to be loaded; a larger one is told by an event."""
 _WAITING_EVERY_S = 1.0
@@ -181,8 +182,8 @@ class Localizing:
             lambda name, text: self._event(bus_messages.WARNING, name, text)
         )
         # A payload that waits for poses has fewer frames on their way than the ring has slots.
-        most = pictures.SLOTS if run.stepped else _QUEUED
-        self._newest = bus.newest(bus_messages.FRAME, FrameMessage, payload_id, most)
+        room = (pictures.SLOTS, math.inf) if run.stepped else (_QUEUED, _OLDEST_S)
+        self._newest = bus.newest(bus_messages.FRAME, FrameMessage, payload_id, *room)
         self._loader.begin(Path(run.station.map.folder))
         bus.serve(bus.process, self._do)
 
@@ -208,20 +209,12 @@ class Localizing:
             self._accounting.skip()
             self._tell_waiting(note)
             return
-        stale = not self._run.stepped and self._behind_s(note) > _OLDEST_S
-        image = None if stale else self._pictures.read(note.slot, note.stamp)
-        if image is None:  # or it was overwritten before it was read
+        image = self._pictures.read(note.slot, note.stamp)
+        if image is None:  # overwritten before it was read
             self._accounting.skip()
             return
         self._follow_stream(self._localizer, note)
         self._localize(self._localizer, note, image)
-
-    def _behind_s(self, note: FrameMessage) -> float:
-        """How much later the newest frame that waits was taken; 0 where none waits."""
-        last = self._newest.last
-        return (
-            0.0 if last is None or last.ssrc != note.ssrc else (last.time_ns - note.time_ns) / 1e9
-        )
 
     def _follow_stream(self, localizer: Localizer, note: FrameMessage) -> None:
         """Begins again where another stream does: the payload was restarted, or its replay was."""
@@ -260,7 +253,11 @@ class Localizing:
             state = State.INITIALIZING if fresh else State.LOST
             told = derive.unsolved_note(note, state, reason, *about)
         said = self._overload.watch(
-            localizer, time.monotonic(), accounts.processed, accounts.skipped, self._behind_s(note)
+            localizer,
+            time.monotonic(),
+            accounts.processed,
+            accounts.skipped,
+            self._newest.waiting_s,
         )
         share = 0.0 if damaged is None else round(float(damaged.mean()), 3)
         told = replace(told, overload=said, damaged=share, coordinates=self._coordinates)
