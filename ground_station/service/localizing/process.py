@@ -64,7 +64,7 @@ class Overload:
     def __init__(self) -> None:
         self._counts: deque[tuple[float, int, int]] = deque()
         self._late_s = self._lengthened_s = float("-inf")
-        self._is_late = False
+        self._waited_s: float | None = None
 
     def watch(
         self, localizer: Localizer, now_s: float, taken: int, skipped: int, waiting_s: float = 0.0
@@ -84,8 +84,11 @@ class Overload:
         lost = skipped - counts[0][2]
         told = lost + taken - counts[0][1]
         rest_s = localizer.rest_s * 0.5 ** ((now_s - last_s) / _HALVED_S)
-        was_late, self._is_late = self._is_late, waiting_s >= WAITING_S
-        if skipped > last_skipped or (self._is_late and not was_late):
+        if waiting_s < WAITING_S:
+            self._waited_s, is_late = None, False
+        elif is_late := self._waited_s is None or now_s >= self._waited_s + _EFFECT_S:
+            self._waited_s = now_s
+        if is_late or skipped > last_skipped:
             again = now_s < self._late_s + _AGAIN_S
             self._late_s = now_s
             if again and now_s >= self._lengthened_s + _EFFECT_S:
@@ -252,12 +255,9 @@ class Localizing:
             fresh = localizer.state is State.INITIALIZING
             state = State.INITIALIZING if fresh else State.LOST
             told = derive.unsolved_note(note, state, reason, *about)
+        waiting_s = 0.0 if self._run.stepped else self._newest.waiting_s  # no clock decides there
         said = self._overload.watch(
-            localizer,
-            time.monotonic(),
-            accounts.processed,
-            accounts.skipped,
-            self._newest.waiting_s,
+            localizer, time.monotonic(), accounts.processed, accounts.skipped, waiting_s
         )
         share = 0.0 if damaged is None else round(float(damaged.mean()), 3)
         told = replace(told, overload=said, damaged=share, coordinates=self._coordinates)
