@@ -9,7 +9,7 @@ EXAMPLE = """\
 examples:
   blimp experiments                       all of them; stopped and started again it goes on
   blimp experiments illumination motion   some of them
-  blimp experiments --quick               one seed, short flights, small maps: to see that all works
+  blimp experiments --quick               one seed, the ends of each table: to see that all works
   blimp experiments illumination redkitchen --features wren mine    your features beside ours
   blimp experiments --list
 
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("names", nargs="*", metavar="NAME", help="experiments (default: all)")
     add("--list", action="store_true", help="say which there are, and nothing else")
     add("--file", type=Path, metavar="TOML", help="experiments (default: the shipped)")
-    add("--quick", action="store_true", help="one seed, short flights, maps of few images")
+    add("--quick", action="store_true", help="one seed, the ends of each table, short flights")
     add("--features", nargs="+", metavar="NAME",
         help="extractors or models for the maps (default: as each row says)")  # fmt: skip
     add("--jobs", type=int, default=0, metavar="N", help="side by side (0: one a core)")

@@ -173,6 +173,14 @@ def test_quick_has_one_seed_short_flights_and_maps_of_which_nothing_is_flown_in_
     assert flown.duration_s * flown.rate_hz == pytest.approx(IMAGES)
 
 
+def test_quick_flies_the_ends_of_each_table():
+    whole = declaration.load()
+    for long, short in zip(whole.experiments, shortened(whole).experiments, strict=True):
+        names = [case.name for case in long.cases]
+        ends = names[:1] if long.cases[0].map.flight.clicked else [names[0], *names[1:][-1:]]
+        assert [case.name for case in short.cases] == ends
+
+
 def test_quick_takes_the_first_seconds_of_real_pictures(declared, tmp_path):
     folder = tmp_path / "hall"
     folder.mkdir()
