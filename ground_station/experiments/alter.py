@@ -42,19 +42,16 @@ class Alteration:
     def of(cls, table: Mapping[str, Any], where: str) -> Alteration:
         """From a row's table `alter`; raises `ConfigError`."""
         known = kinds()
-        for name in table:
+        own: dict[type[Disturbance], dict[str, Any]] = {kind: {} for kind in known.values()}
+        for name, value in table.items():
             if name not in known:
                 there = ", ".join(sorted(known))
                 raise ConfigError(f"{where}: unknown key 'alter.{name:.60}' (known here: {there})")
+            own[known[name]][name] = value
+        where = f"{where}: alter"
         return cls(
             tuple(
-                config.from_mapping(
-                    {name: value for name, value in table.items() if known[name] is kind},
-                    kind,
-                    where=f"{where}: alter",
-                )
-                for kind in dict.fromkeys(known.values())
-                if any(known[name] is kind for name in table)
+                config.from_mapping(keys, kind, where=where) for kind, keys in own.items() if keys
             )
         )
 

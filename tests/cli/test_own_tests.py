@@ -10,8 +10,11 @@ from pathlib import Path
 REPOSITORY = Path(__file__).resolve().parents[2]
 ELSEWHERE = REPOSITORY / "tests/cli/covered_elsewhere.txt"
 PACKAGES = ("pi_firmware", "ground_station", "deploy", "hw")
-ROOMS = {"cli": ("cli", "commands"), "replay": ("replay", "hil")}
-ROOMS["pi_firmware"] = ("pi_firmware", "wire", "i2c", "faults")
+ROOMS = {
+    "cli": ("cli", "commands"),
+    "replay": ("replay", "hil"),
+    "pi_firmware": ("pi_firmware", "wire", "i2c", "faults"),
+}
 """Rooms whose tests are in more folders than the one of their name."""
 
 

@@ -38,8 +38,9 @@ from ground_station.service.bus_messages import EstimateMessage
 from ground_station.service.ending import status_of
 from ground_station.service.localizing import __main__ as main
 from ground_station.service.localizing import maps
-from ground_station.service.localizing.process import RESTART, Localizing
+from ground_station.service.localizing.process import RESTART, Localizing, Overload
 from ground_station.service.pictures import SLOTS
+from ground_station.stream.newest import Newest
 
 FLIGHT = SAMPLE / "flight.mcap"
 TRUTH = trajectory_of(FLIGHT)
@@ -314,11 +315,11 @@ def test_bad_input_is_one_line_and_status_2(
 
 
 @contextlib.contextmanager
-def in_a_thread(told: Station) -> Iterator[list[int]]:
+def in_a_thread(told: Station, *, stepped: bool = False) -> Iterator[list[int]]:
     """The process's loop in this one, until the block ends; the status that it gave, then."""
     stop, ended = threading.Event(), list[int]()
-    with Bus(told.folder, NAME) as bus:
-        localizing = Localizing(bus, told.folder, PAYLOAD, told.run)
+    with Bus(told.folder, NAME, lossless=stepped) as bus:
+        localizing = Localizing(bus, told.folder, PAYLOAD, replace(told.run, stepped=stepped))
         thread = threading.Thread(target=lambda: ended.append(localizing.run(stop)))
         thread.start()
         try:
@@ -394,6 +395,19 @@ def test_failures_are_counted_and_ten_in_a_row_end_it(
             eventually(lambda: bool(ended), what="the end")
             eventually(lambda: told.event("localizer-failed") is not None, what="the event")
     assert ended == ([RESTART] if times == 10 else [0])
+
+
+@pytest.mark.parametrize("stepped", [False, True])
+def test_how_long_frames_wait_counts_unless_no_clock_is_to_decide(
+    tmp_path: Path, flight: list[Frame], monkeypatch: pytest.MonkeyPatch, stepped: bool
+) -> None:
+    heard: list[float] = []
+    monkeypatch.setattr(Newest, "waiting_s", 0.25)
+    monkeypatch.setattr(Overload, "watch", lambda *known: heard.append(known[-1]) or "")
+    with Station(tmp_path) as told, in_a_thread(told, stepped=stepped):
+        eventually(lambda: told.event("map-loaded") is not None, what="the map")
+        localized(told, flight[0])
+    assert heard == [0.0 if stepped else 0.25]
 
 
 def test_a_localizer_that_is_killed_is_counted_on_and_another_session_anew(

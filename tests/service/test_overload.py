@@ -69,6 +69,13 @@ def test_frames_that_are_late_again_make_keyframes_rare_before_any_is_skipped(lo
     assert 0 < rests[-1] < 0.5
 
 
+def test_frames_that_stay_late_make_keyframes_rarer_still(localizer):
+    overload = Overload()
+    for k in range(90):
+        overload.watch(localizer, k / 30, k + 1, 0, 0.2)
+    assert localizer.rest_s > 2 * FIRST_REST_S
+
+
 def test_late_features_alone_are_said_and_shed_nothing(localizer):
     localizer.keyframe_late_s = 1.4
     said = fly(Overload(), localizer, 1, 60)

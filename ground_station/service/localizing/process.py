@@ -47,7 +47,7 @@ _EFFECT_S = 0.5
 _HALVED_S = 8.0
 """In this a rest that is too long shrinks by half: slower than it grows, so that few frames pay."""
 WAITING_S = 0.12
-"""A frame that waits so long is late: four frames wait at 30 Hz."""
+"""A frame that waits so long is late: with half of the queue at 30 Hz, with one more at 10."""
 _AGAIN_S = 5.0
 """A frame that is late or skipped so long after the one before is an accident, and keyframes that
 rest still are no news."""
