@@ -166,6 +166,9 @@ def test_quick_has_one_seed_short_flights_and_maps_of_which_nothing_is_flown_in_
     made = plan.make(shortened(declared), MappingSettings(), Path("none"))
     assert {job.seed for job in of(made, RunJob)} == {1}
     assert {job.flight.duration_s for job in of(made, RunJob)} == {FLIGHT_S}
+    assert {job.flight.rate_hz for job in of(made, RunJob)} == {
+        case.flight.rate_hz / 2 for case in large
+    }
     (mapped,) = of(made, MapJob)
     assert mapped.spec.images == IMAGES
     flown = mapped.spec.flight
@@ -187,7 +190,7 @@ def test_quick_takes_the_first_seconds_of_real_pictures(declared, tmp_path):
     (tmp_path / "t.txt").touch()
     (tmp_path / "c.toml").touch()
     case = declared.experiments[0].cases[0]
-    for given, taken in (("500:1000", "500:650:1"), ("500:600:2", "500:600:2"), ("", "0:150:1")):
+    for given, taken in (("500:1000", "500:650:2"), ("500:600:2", "500:600:4"), ("", "0:150:2")):
         real = FlightDeclaration(
             folder="hall", truth="t.txt", camera="c.toml", range=given, rate_hz=30.0
         )
