@@ -184,15 +184,17 @@ def _open(args: argparse.Namespace) -> tuple[list[FrameSource], list[bool]]:
     from ground_station.recording.open import open_input, parse_range
     from ground_station.recording.video import VideoFile
 
-    rate_hz = 30.0 if args.rate_hz is None else args.rate_hz
     wanted = parse_range(args.range) if args.range else None
     seconds = 60.0 if args.seconds is None else args.seconds
     sources: list[Any] = [
-        LiveFrames(text, seconds) if _is_live(text) else open_input(text, rate_hz, wanted)
+        LiveFrames(text, seconds) if _is_live(text) else open_input(text, args.rate_hz, wanted)
         for text in args.inputs
     ]
     own = (FlightRecording, VideoFile, LiveFrames)
-    return sources, [args.rate_hz is not None or isinstance(source, own) for source in sources]
+    return sources, [
+        args.rate_hz is not None or isinstance(source, own) or getattr(source, "timed", False)
+        for source in sources
+    ]
 
 
 class _Hints:

@@ -43,7 +43,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--camera", metavar="CAMERA.toml", help="default: the input's own, else the map's"
     )
     parser.add_argument(
-        "--rate-hz", type=float, default=30.0, metavar="R", help="of a folder of images (30)"
+        "--rate-hz",
+        type=float,
+        metavar="R",
+        help="of a folder of images (times that they are named by, or 30)",
     )
     parser.add_argument(
         "--smoothed", metavar="SMOOTHED.txt",

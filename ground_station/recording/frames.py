@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from pi_firmware.wire.recording import RecordingWriter
 
 
+RATE_HZ = 30.0
+"""Of frames that tell no times and are given no rate."""
+
+
 @dataclass(frozen=True)
 class Frame:
     """One picture. `index` counts in the input from 0; `image` is (H, W) uint8, grey.

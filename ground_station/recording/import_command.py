@@ -30,7 +30,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="F.mcap", help="what to write")
     parser.add_argument("--range", metavar="A:B[:S]", help="frames A to B-1, every S-th")
     parser.add_argument(
-        "--rate-hz", type=float, default=30.0, metavar="R", help="of a folder of images (30)"
+        "--rate-hz",
+        type=float,
+        metavar="R",
+        help="of a folder of images (times that they are named by, or 30)",
     )
 
 

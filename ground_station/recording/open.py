@@ -9,7 +9,7 @@ from pathlib import Path
 from ground_station.errors import InputError
 from ground_station.recording.flight import FlightRecording
 from ground_station.recording.folder import ImageFolder
-from ground_station.recording.frames import ALL_FRAMES, FrameRange, FrameSource
+from ground_station.recording.frames import ALL_FRAMES, RATE_HZ, FrameRange, FrameSource
 from ground_station.recording.video import AnnexBFile, VideoFile
 from pi_firmware.wire.errors import os_errors_as
 from pi_firmware.wire.mcap_records import MAGIC
@@ -18,17 +18,17 @@ _ANNEX_B_SUFFIXES = {".h264", ".264", ".avc"}
 
 
 def open_input(
-    path: str | Path, rate_hz: float = 30.0, frame_range: FrameRange | None = None
+    path: str | Path, rate_hz: float | None = None, frame_range: FrameRange | None = None
 ) -> FrameSource:
     """The frames of an input; nothing is decoded before the iteration.
 
     `rate_hz` gives times to what has none (folders, raw H.264): frame k is at k / rate_hz s,
-    whatever the range. Raises `InputError`, `RecordingError` or `CameraError`, one line each, here
-    or while iterating.
+    whatever the range. None: images named by their times have those, all else 30 Hz. Raises
+    `InputError`, `RecordingError` or `CameraError`, one line each, here or while iterating.
     """
     path = Path(path)
     wanted = frame_range or ALL_FRAMES
-    if not (math.isfinite(rate_hz) and 0.001 <= rate_hz <= 10_000):
+    if rate_hz is not None and not (math.isfinite(rate_hz) and 0.001 <= rate_hz <= 10_000):
         raise InputError(f"the frame rate is {rate_hz} Hz; allowed: 0.001 to 10000 Hz")
     if path.is_dir():
         return ImageFolder(path, rate_hz, wanted)
@@ -39,8 +39,8 @@ def open_input(
     if head == MAGIC or path.suffix.lower() == ".mcap":
         return FlightRecording(path, wanted)
     if path.suffix.lower() in _ANNEX_B_SUFFIXES or _starts_as_annex_b(head):
-        return AnnexBFile(path, rate_hz, wanted)
-    return VideoFile(path, rate_hz, wanted)
+        return AnnexBFile(path, rate_hz or RATE_HZ, wanted)
+    return VideoFile(path, rate_hz or RATE_HZ, wanted)
 
 
 def _starts_as_annex_b(head: bytes) -> bool:

@@ -12,7 +12,7 @@ import av
 
 from ground_station.errors import InputError
 from ground_station.geometry.camera import Camera
-from ground_station.recording.frames import ALL_FRAMES, Frame, FrameRange
+from ground_station.recording.frames import ALL_FRAMES, RATE_HZ, Frame, FrameRange
 from ground_station.recording.h264 import Decoder, grey, parameter_sets_in
 from pi_firmware.wire.errors import os_errors_as
 
@@ -30,7 +30,7 @@ class VideoFile:
     """
 
     def __init__(
-        self, path: Path, rate_hz: float = 30.0, frame_range: FrameRange = ALL_FRAMES
+        self, path: Path, rate_hz: float = RATE_HZ, frame_range: FrameRange = ALL_FRAMES
     ) -> None:
         self.path = path
         self.camera: Camera | None = None
@@ -167,7 +167,7 @@ class AnnexBFile:
     """A raw H.264 byte stream (Annex B). It has no times: picture k is at k / `rate_hz` s."""
 
     def __init__(
-        self, path: Path, rate_hz: float = 30.0, frame_range: FrameRange = ALL_FRAMES
+        self, path: Path, rate_hz: float = RATE_HZ, frame_range: FrameRange = ALL_FRAMES
     ) -> None:
         self.path = path
         self.camera: Camera | None = None

@@ -51,6 +51,60 @@ def test_a_range_changes_neither_times_nor_indices(folder: Path) -> None:
         assert frame.time_ns == whole[frame.name].time_ns == round(frame.index * 1e9 / 30)
 
 
+def of_names(folder: Path, names: list[str]) -> Path:
+    """A folder of small images of these names."""
+    folder.mkdir()
+    for name in names:
+        cv2.imwrite(str(folder / name), np.zeros((4, 4), np.uint8))
+    return folder
+
+
+def test_numbers_in_names_are_counted(tmp_path: Path) -> None:
+    names = ["a1.png", "a2.png", "a02.png", "a10.png", "a10b.png", "b1.png"]
+    folder = of_names(tmp_path / "frames", names)
+    assert [f.name for f in open_input(folder)] == ["a1.png", "a02.png", *names[1:2], *names[3:]]
+
+
+@pytest.mark.parametrize(
+    ("names", "times_ns"),
+    [
+        (["9.5000.png", "10.250.png"], [9_500_000_000, 10_250_000_000]),
+        (["1305031452.791720.png", "1305031453.123.png"],
+         [1305031452791720000, 1305031453123000000]),
+        (["1403636579763555584.png", "1403636579813555456.png"], None),
+        (["1403636579763555.png", "1403636579813555.png"], None),
+        (["1403636579763.png", "1403636579813.png"], None),
+    ],
+)  # fmt: skip
+def test_images_named_by_their_times_have_those(
+    tmp_path: Path, names: list[str], times_ns: list[int] | None
+) -> None:
+    folder = of_names(tmp_path / "frames", names)
+    source = open_input(folder)
+    if times_ns is None:  # of whole numbers since 1970
+        times_ns = [int(Path(name).stem.ljust(19, "0")) for name in names]
+    assert [(f.name, f.time_ns) for f in source] == list(zip(names, times_ns, strict=True))
+    assert source.notes == [f"{folder}: its images are named by their times, and have those"]
+    given = open_input(folder, rate_hz=10.0)
+    assert [(f.name, f.time_ns) for f in given] == list(zip(names, [0, 100_000_000], strict=True))
+    assert given.notes == []
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["1.25.png", "1.26.png"],  # sections, not seconds
+        ["0000000000001.png", "0000000000002.png"],
+        ["1305031452.7917.png", "1305031452.791700.png"],  # the same time twice
+        ["1305031452.791720.png", "cover.png"],
+        ["9999999999999999998.png", "9999999999999999999.png"],  # beyond 64 bits
+    ],
+)
+def test_other_names_are_no_times(tmp_path: Path, names: list[str]) -> None:
+    source = open_input(of_names(tmp_path / "frames", names))
+    assert [f.time_ns for f in source] == [0, round(1e9 / 30)] and source.notes == []
+
+
 def test_iterating_twice_starts_anew(folder: Path) -> None:
     source = open_input(folder)
     assert [f.name for f in source] == [f.name for f in source]

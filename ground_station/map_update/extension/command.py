@@ -27,7 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("inputs", nargs="+", metavar="INPUT", help="recording, video or folder")
     parser.add_argument("--camera", metavar="TOML", help="default: the input's own, else the map's")
     parser.add_argument("--range", metavar="A:B[:S]", help="frames A up to B, every S-th")
-    parser.add_argument("--rate-hz", type=float, default=30.0, help="of a folder (default 30)")
+    parser.add_argument(
+        "--rate-hz", type=float, help="of a folder (default: its names' times, or 30)"
+    )
     add_outputs(parser)
 
 

@@ -82,7 +82,7 @@ def extend_map(
     *,
     camera: Camera | None = None,
     out: str | Path | None = None,
-    rate_hz: float = 30.0,
+    rate_hz: float | None = None,
     frame_range: FrameRange | None = None,
 ) -> tuple[store.Map, Extension]:
     """Adds recordings, videos or folders to a map on disk; to `out`, or in its place.

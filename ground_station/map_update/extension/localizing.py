@@ -51,7 +51,7 @@ def localize(
     settings: LocalizerSettings,
     *,
     camera: Camera | None = None,
-    rate_hz: float = 30.0,
+    rate_hz: float | None = None,
     frame_range: FrameRange | None = None,
 ) -> LocatedFlight:
     """Localizes every frame of a recording, video or folder.

@@ -42,7 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="MAP", help="folder of the map")
     parser.add_argument("--features", help="extractor or model by name (default: the settings')")
     parser.add_argument("--range", metavar="A:B[:S]", help="frames A to B, with S every S-th")
-    parser.add_argument("--rate-hz", type=float, default=30.0, help="of a folder (default 30)")
+    parser.add_argument(
+        "--rate-hz", type=float, help="of a folder (default: its names' times, or 30)"
+    )
     parser.add_argument(
         "--max-images", type=int, metavar="N",
         help="of a longer input so many keyframes at most (default: the settings')",

@@ -97,7 +97,7 @@ def open_inputs(
     settings: MappingSettings,
     *,
     camera: str | None = None,
-    rate_hz: float = 30.0,
+    rate_hz: float | None = None,
     frames: str | None = None,
 ) -> Inputs:
     """Opens the inputs of a map and chooses their frames.
@@ -117,13 +117,14 @@ def open_inputs(
     built: dict[str, Any] = {
         "inputs": [Path(path).name for path in paths],
         "range": frames or "::",
-        "rate_hz": rate_hz,
         "lens_prior": {
             "source": prior.source,
             "focal_px": round(prior.camera.fx_px, 2),
             "sigma_focal": round(prior.sigma_focal, 4),
         },
     }
+    if rate_hz is not None:
+        built["rate_hz"] = rate_hz
     if lens.display_deg:
         built["display_deg"] = lens.display_deg
     counts = [source.count() for source in sources]

@@ -137,7 +137,8 @@ def _seen_tags(args: argparse.Namespace) -> Any:
     from ground_station.recording.open import open_input
 
     tags, map_ = read_tags(args.tags), store.load(args.map)
-    rate_hz = float(map_.info.built.get("rate_hz", 30.0))
+    given = map_.info.built.get("rate_hz")
+    rate_hz = None if given is None else float(given)
     sources = [open_input(path, rate_hz) for path in args.frames]
     counts = [source.count() for source in sources]
     total = None if None in counts else sum(count or 0 for count in counts)
