@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from ground_station import __version__
-from pi_firmware.wire.errors import BlimpError
+from pi_firmware.wire.errors import BlimpError, until_closed
 from pi_firmware.wire.text import printable
 
 _COMMANDS = (
@@ -103,14 +103,7 @@ def next_of(args: argparse.Namespace) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command; the exit status is 0, 1 (a bound was missed) or 2 (bad input)."""
-    try:
-        try:
-            return _run(parser().parse_args(arguments))
-        finally:
-            sys.stdout.flush()
-    except BrokenPipeError:  # `blimp … | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    return until_closed(lambda: _run(parser().parse_args(arguments)))
 
 
 def _run(args: argparse.Namespace) -> int:

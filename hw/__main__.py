@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from hw.command import parser
-from pi_firmware.wire.errors import BlimpError
+from pi_firmware.wire.errors import BlimpError, until_closed
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -28,4 +28,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(until_closed(main))

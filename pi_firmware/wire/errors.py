@@ -1,7 +1,9 @@
 """The exception family: every error a person can cause is a `BlimpError` with a one-line text."""
 
 import contextlib
-from collections.abc import Iterator
+import os
+import sys
+from collections.abc import Callable, Iterator
 
 from pi_firmware.wire.text import printable
 
@@ -50,3 +52,15 @@ def os_errors_as(what: object, kind: type[BlimpError]) -> Iterator[None]:
         yield
     except OSError as error:
         raise kind(f"{what}: {error.strerror or error}") from None
+
+
+def until_closed(program: Callable[[], int]) -> int:
+    """Runs a program's main function; its status, 0 where nobody reads on (`… | head`)."""
+    try:
+        try:
+            return program()
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
