@@ -42,6 +42,7 @@ class ImageFolder:
             found = [p for p in path.iterdir() if p.suffix.lower() in SUFFIXES]
         if not found:
             raise InputError(f"{path}: no images in this folder (jpg, png, bmp, tif, webp, pgm)")
+        _check_one_camera(path, found)
         named_ns = _times_ns(found)
         self.timed = bool(named_ns) and rate_hz is None
         if self.timed:
@@ -75,6 +76,23 @@ class ImageFolder:
                 )
             shape = image.shape
             yield Frame(k, path.name, time_ns, image)
+
+
+def _check_one_camera(folder: Path, paths: Sequence[Path]) -> None:
+    """Refuses pairs of images that differ in a word only, as colour and depth or left and right."""
+    kinds: dict[str, set[tuple[str, ...]]] = {}
+    for path in paths:
+        kind = re.sub("[0-9]+", "#", path.name)
+        kinds.setdefault(kind, set()).add(tuple(re.findall("[0-9]+", path.name)))
+    first: dict[frozenset[tuple[str, ...]], str] = {}
+    for kind, numbers in kinds.items():
+        other = first.setdefault(frozenset(numbers), kind)
+        if other != kind and len(numbers) > 1:
+            raise InputError(
+                f"{folder}: it holds both {min(kind, other)} and {max(kind, other)} of each "
+                "number, as of depth or of a second camera: put those of one camera into a folder "
+                "of their own"
+            )
 
 
 def _counted(path: Path) -> tuple[list[int | str], str]:

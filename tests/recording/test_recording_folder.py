@@ -105,6 +105,16 @@ def test_other_names_are_no_times(tmp_path: Path, names: list[str]) -> None:
     assert [f.time_ns for f in source] == [0, round(1e9 / 30)] and source.notes == []
 
 
+def test_pictures_of_two_kinds_are_refused(tmp_path: Path) -> None:
+    names = [f"frame-{k:02d}.{kind}.png" for k in (1, 2) for kind in ("color", "depth")]
+    folder = of_names(tmp_path / "frames", names)
+    with pytest.raises(InputError) as refused:
+        open_input(folder)
+    assert "both frame-#.color.png and frame-#.depth.png of each number" in str(refused.value)
+    (folder / names[1]).unlink()
+    assert len(list(open_input(folder))) == 3  # other numbers: pictures that two people took
+
+
 def test_iterating_twice_starts_anew(folder: Path) -> None:
     source = open_input(folder)
     assert [f.name for f in source] == [f.name for f in source]
