@@ -158,6 +158,8 @@ def _until_done(
             for key in open_
             if key not in busy and not any(need in open_ for need in plan.needs[key])
         ]
+        # Runs come last: beside the last map, which takes longest, they fill the other processes.
+        ready.sort(key=lambda key: isinstance(open_[key], RunJob))
         # No more than are worked on at a time, so that none waits beside one that ends its process.
         free = max(1, sum(client.nthreads().values())) - len(running)
         for key in [] if error else ready[: max(0, free)]:

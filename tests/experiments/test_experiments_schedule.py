@@ -117,6 +117,14 @@ def done(folder: Path) -> list[str]:
     return path.read_text().split() if path.exists() else []
 
 
+def test_runs_wait_for_other_maps(tmp_path):
+    plan = a_plan()
+    last = replace(plan.jobs["m"], key="m2")
+    plan = Plan({**plan.jobs, "m2": last}, {**plan.needs, "m2": ("f",)}, {})
+    assert carry_out(plan, Store(tmp_path), tmp_path, 1, note) == 6
+    assert done(tmp_path) == ["f", "m", "m2", "r0", "r1", "r2"]
+
+
 def test_each_job_is_done_once_after_what_it_needs(tmp_path):
     assert carry_out(a_plan(), Store(tmp_path), tmp_path, 2, note) == 5
     assert done(tmp_path)[:2] == ["f", "m"] and sorted(done(tmp_path)[2:]) == ["r0", "r1", "r2"]

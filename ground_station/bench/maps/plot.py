@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import NullFormatter, StrMethodFormatter
 
 from ground_station.presentation.theme import LIGHT, figure_of, legend
 
@@ -43,7 +43,9 @@ def scaling_plot(rows: Sequence[dict[str, Any]], most_gb: float) -> Figure:
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_ylabel(name)
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         legend(axes, LIGHT, loc="best", frameon=False, fontsize=8)
+    lower.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}"))  # less than a decade
     lower.set_xticks(x, [str(size) for size in x])
     lower.xaxis.set_minor_formatter(NullFormatter())
     lower.set_xlabel("images of a simulated campus")
