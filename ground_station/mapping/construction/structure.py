@@ -237,6 +237,10 @@ class _Consistent:
         return pieces
 
 
+_FEWEST = 15
+"""Observations that an image keeps where it stands: COLMAP's `min_num_matches` to be placed."""
+
+
 def _size(model: colmap.Reconstruction) -> int:
     return int(model.num_reg_images())
 
@@ -267,9 +271,14 @@ def adjust_and_filter(
 
     Robust bundle adjustment, then observations above `max_error_px` and points below `min_track`
     or `min_tri_angle_deg` go; twice, because the first round's outliers bend the second's poses.
+    An image goes when what is left of it would not have placed it.
     """
     for tolerance in _TOLERANCES:
         adjustment.adjust(reconstruction, loss_px=sfm.loss_px, threads=threads, tolerance=tolerance)
+        model = drop_misfits(reconstruction, sfm)
+    few = np.bincount(model.image, minlength=len(model.names)) < _FEWEST
+    if few.any():
+        colmap.drop_images(reconstruction, model.image_id[few].tolist())
         model = drop_misfits(reconstruction, sfm)
     if not len(model.point_id):
         raise MapError(

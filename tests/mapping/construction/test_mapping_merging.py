@@ -154,6 +154,18 @@ def test_an_image_that_stands_aside_goes_where_the_others_see_it(corridor, tmp_p
     assert geometry.error_m(corridor, found).max() < 0.03 < geometry.error_m(corridor, aside).max()
 
 
+@pytest.mark.parametrize(("kept", "stands"), [(8, False), (40, True)])
+def test_an_image_of_which_little_is_left_goes(corridor, tmp_path, kept, stands):
+    model = _solver(corridor, tmp_path).solve("all", corridor.pairs)[0][0]
+    seen = colmap.to_arrays(model)
+    mine = np.flatnonzero(seen.image_id[seen.image] == 21)[kept:]
+    colmap.drop_observations(model, seen.image_id[seen.image[mine]], seen.feature[mine])
+    found = structure.adjust_and_filter(model, MappingSettings().sfm, 1)
+    names = corridor.images.names
+    assert found.names == (names if stands else names[:20] + names[21:])
+    assert np.bincount(found.image).min() >= 15
+
+
 def test_what_is_left_without_misfits_is_the_model_itself(corridor, tmp_path):
     model = _solver(corridor, tmp_path).solve("all", corridor.pairs)[0][0]
     before = colmap.to_arrays(model)
