@@ -181,6 +181,7 @@ def _open(args: argparse.Namespace) -> tuple[list[FrameSource], list[bool]]:
     """The inputs, and of each whether its frames' times are the camera's."""
     from ground_station.calibration.live import LiveFrames
     from ground_station.recording.flight import FlightRecording
+    from ground_station.recording.folder import ImageFolder
     from ground_station.recording.open import open_input, parse_range
     from ground_station.recording.video import VideoFile
 
@@ -192,7 +193,9 @@ def _open(args: argparse.Namespace) -> tuple[list[FrameSource], list[bool]]:
     ]
     own = (FlightRecording, VideoFile, LiveFrames)
     return sources, [
-        args.rate_hz is not None or isinstance(source, own) or getattr(source, "timed", False)
+        args.rate_hz is not None
+        or isinstance(source, own)
+        or (isinstance(source, ImageFolder) and source.timed)
         for source in sources
     ]
 

@@ -1,5 +1,6 @@
 """`blimp calibrate`: a board, pictures of it, a camera's file; bad input in one line."""
 
+import argparse
 import json
 import socket
 import sys
@@ -17,6 +18,7 @@ from board_flight import write_board_flight
 from board_views import BoardCamera, carried
 
 from ground_station.calibration.board import Board, load_board, write_board
+from ground_station.calibration.command import _open
 from ground_station.calibration.live import LiveFrames, parse_uri
 from ground_station.cli import main
 from ground_station.errors import InputError
@@ -209,3 +211,13 @@ def test_a_stream_that_cannot_be_shown_says_why(port: int) -> None:
 def test_a_silent_port_is_said(port: int) -> None:
     with pytest.raises(InputError, match=f":{port}: no video came within"):
         list(LiveFrames(f"udp://127.0.0.1:{port}", 0.2))
+
+
+@pytest.mark.parametrize(
+    ("name", "rate_hz", "timed"),
+    [("9.500.png", None, True), ("board-9.png", None, False), ("board-9.png", 30.0, True)],
+)
+def test_images_time_the_shutter_where_their_times_are_known(tmp_path, name, rate_hz, timed):
+    cv2.imwrite(str(tmp_path / name), np.zeros((4, 4), np.uint8))
+    asked = argparse.Namespace(inputs=[str(tmp_path)], rate_hz=rate_hz, range=None, seconds=None)
+    assert _open(asked)[1] == [timed]

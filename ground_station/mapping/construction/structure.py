@@ -238,7 +238,8 @@ class _Consistent:
 
 
 _FEWEST = 15
-"""Observations that an image keeps where it stands: COLMAP's `min_num_matches` to be placed."""
+"""Observations that an image keeps where it stands: COLMAP asks so many to place one at the last
+(`min_num_matches`)."""
 
 
 def _size(model: colmap.Reconstruction) -> int:
