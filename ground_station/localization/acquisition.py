@@ -93,11 +93,12 @@ class Acquirer:
         self.matcher, self._extractor, self._settings = matcher, extractor, settings
         self._landmarks, self._depth_m = map_.landmarks, map_.depth_m
         recovery = settings.recovery
-        self._relocalizer = (
-            Relocalizer(map_, matcher.camera, recovery, settings.seed, matcher.scale)
-            if recovery.relocalize
-            else None
-        )
+        self._relocalizer: Relocalizer | None = None
+        if recovery.relocalize:
+            self._relocalizer = Relocalizer(
+                map_, matcher.camera, recovery, settings.seed, matcher.scale,
+                settings.start.turn_deg_s,
+            )  # fmt: skip
 
     def describe(self, image: U8, taken: Conditions) -> Described:
         """The features of a grey frame (H, W)."""
@@ -232,6 +233,7 @@ class Acquirer:
         estimator.restart(time_ns, sole.wTc, self._open(sole))
         alone = estimator.predict(time_ns)
         assert alone is not None
+        seen = seen.showing(sole.landmark)
         located = self.locate(seen, alone, estimator, watch, _FOUND_RADIUS_PX)
         return unless_near(replace(located, relocalized=True, significance=sole.significance))
 
@@ -272,6 +274,7 @@ class Acquirer:
         solution = believed(estimator.solve(expected, observations, settings), self._settings)
         if solution.state is None or not solution.innovation < _ALLOWED:
             return None
+        seen = seen.showing(found.landmark)
         located = self.locate(seen, expected, estimator, watch, _FOUND_RADIUS_PX, solution.state)
         return None if located.solution.state is None else located
 

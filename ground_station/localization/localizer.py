@@ -125,7 +125,7 @@ class Localizer:
         self._worker.drop()
         self._replace(self._fresh())
         self._estimator.restart(time_ns, T)
-        self._keyframe = None
+        self._keyframe, self._seen = None, None
 
     def smoothed(self) -> list[Kinematics]:
         """Poses that later frames helped to estimate, each once, some frames after its own.

@@ -16,9 +16,13 @@ from ground_station.localization.association import Associations, associate
 from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.blur import blurred_sigma_px, expected_blur_px
 from ground_station.localization.kinematics import Kinematics, LandmarkObservations
-from ground_station.localization.settings import WIDTH_PX, LocalizerSettings
+from ground_station.localization.settings import (
+    WIDTH_PX,
+    LocalizerSettings,
+    ProjectionSettings,
+)
 from ground_station.localization.verification import APART, Support, Witness
-from ground_station.localization.visibility import Covisibility, LandmarkIndex, project
+from ground_station.localization.visibility import Covisibility, LandmarkIndex, project, widened
 from ground_station.map.modes import described
 from ground_station.map.store import Map
 
@@ -53,6 +57,10 @@ class Described:
 
     def __len__(self) -> int:
         return len(self.features)
+
+    def showing(self, landmark: Indices) -> Described:
+        """The same, where landmarks (N,) were found."""
+        return replace(self, taken=replace(self.taken, recent=landmark))
 
 
 def describe(features: Features, camera: Camera, taken: Conditions) -> Described:
@@ -133,10 +141,11 @@ class Matcher:
         is asked instead of the settings'.
         """
         settings, landmarks = self.settings, self.landmarks
-        among = self._index.near(expected.wTc, self.camera, settings.projection)
+        cones = self._cones(seen, expected.wTc)
+        among = self._index.near(expected.wTc, self.camera, cones)
         if self._covisibility is not None and seen.taken.recent is not None:
             among = self._covisibility.covisible(seen.taken.recent, expected.wTc, among)
-        projected = project(landmarks, expected.wTc, self.camera, settings.projection, among)
+        projected = project(landmarks, expected.wTc, self.camera, cones, among)
         where = projected.pinhole_px
         radius: float | F64 = radius_px or self.radius_px
         if self.camera.model == "fisheye":  # or an array of ones would cost the others time
@@ -209,19 +218,23 @@ class Matcher:
         Near a wrong pose features pair up as well, and agree with each other as far as they were
         looked for. Landmarks shifted aside tell how many do so by chance.
         """
-        return self._witness(seen).support(wTc, self.landmarks, self._among(wTc, nearer_than))
+        among, recent = self._among(seen, wTc, nearer_than), seen.taken.recent
+        return self._witness(seen).support(wTc, self.landmarks, among, recent)
 
     def counts(self, seen: Described, wTc: Sequence[F64], nearer_than: float) -> list[int]:
         """How many landmarks of less than a depth are seen from poses (4, 4) that are alike."""
-        witness, among = self._witness(seen), self._among(wTc[0], nearer_than)
-        return [witness.count(each, self.landmarks, among) for each in wTc]
+        witness, among = self._witness(seen), self._among(seen, wTc[0], nearer_than)
+        return [witness.count(each, self.landmarks, among, seen.taken.recent) for each in wTc]
 
     def _witness(self, seen: Described) -> Witness:
         return Witness(seen.features, self.camera, self._modes, self.scale)
 
-    def _among(self, wTc: F64, nearer_than: float) -> Indices:
-        among = self._index.near(wTc, self.camera, self.settings.projection)
+    def _among(self, seen: Described, wTc: F64, nearer_than: float) -> Indices:
+        among = self._index.near(wTc, self.camera, self._cones(seen, wTc))
         return among if nearer_than == np.inf else among[self.depth(wTc, among) < nearer_than]
+
+    def _cones(self, seen: Described, wTc: F64) -> ProjectionSettings:
+        return widened(self.settings.projection, self.landmarks, seen.taken.recent, wTc[:3, 3])
 
     def depth(self, wTc: F64, landmark: Indices) -> F64:
         """How far before a camera at `wTc` (4, 4) landmarks (N,) are, (N,)."""

@@ -17,7 +17,7 @@ from ground_station.geometry import poses
 from ground_station.geometry.camera import Camera
 from ground_station.localization.matching import Described, pixel_jacobian
 from ground_station.localization.retrieval import PlaceIndex
-from ground_station.localization.settings import RecoverySettings
+from ground_station.localization.settings import RecoverySettings, StartSettings
 from ground_station.localization.verification import Witness
 from ground_station.map.modes import described
 from ground_station.map.store import Map
@@ -141,11 +141,9 @@ _NEIGHBOURS = 12
 """Keyframes that saw most of a found pose's inliers: what they saw should be seen."""
 _MIN_MATCHED = 12
 """Inliers of RANSAC that are worth the check that follows."""
-_MAX_SIGMA = 0.005
-"""Of the position, from the inliers alone, over their depth: beyond, a rolling shutter's shear
-moves it far. Right finds of an atrium, a kitchen and a corridor had 0.003 at most."""
 _SAME = 0.05
-"""Two poses nearer than this share of the map's depth are one."""
+"""Two poses nearer than this share of the map's depth are one. Nor may the shear of a rolling
+shutter, which nobody knows of a first frame, move the position by more of the inliers' depth."""
 _RIVAL = 0.5
 """A pose elsewhere with this share of the best one's inliers leaves the place undecided."""
 
@@ -182,13 +180,14 @@ class _Search:
             return f"{len(inliers)} inliers of {len(feature)} matches"
         return wTc, candidates[row[inliers]]
 
-    def confirm(self, wTc: F64, expected: Indices) -> Relocalization | str:
-        """The pose refined over all landmarks that should be seen, or why it is refused."""
+    def confirm(self, wTc: F64, seen: Indices, expected: Indices) -> Relocalization | str:
+        """The pose refined over all landmarks that should be seen, beside those that RANSAC took
+        for `seen` (N,), or why it is refused."""
         settings = self.settings
-        support = self.witness.support(wTc, self.landmarks, expected)
+        support = self.witness.support(wTc, self.landmarks, expected, seen)
         if len(support.feature) >= _MIN_MATCHED:
             wTc = self._refine(wTc, support.feature, support.landmark)
-            support = self.witness.support(wTc, self.landmarks, expected)
+            support = self.witness.support(wTc, self.landmarks, expected, seen)
         near = self._residual_px(wTc, support.feature, support.landmark)
         good = near < settings.max_reprojection_px
         feature, landmark = support.feature[good], support.landmark[good]
@@ -209,13 +208,12 @@ class _Search:
         return Relocalization(wTc, feature, landmark, support.significance, open_by, doubt)
 
     def _sigma(self, wTc: F64, landmark: Indices) -> float:
-        """Standard deviation of the position over the inliers' depth, at half the threshold."""
+        """Standard deviation of the position over the inliers' depth."""
         points = self.landmarks.position_m[landmark]
         depth = poses.transform(poses.inverse(wTc), points)[:, 2]
         u, v = pixel_jacobian(points, wTc, self.camera).swapaxes(0, 1)
-        sigma_px = self.settings.max_reprojection_px / 2
         try:
-            covariance = np.linalg.inv((u.T @ u + v.T @ v) / sigma_px**2)
+            covariance = np.linalg.inv((u.T @ u + v.T @ v) / _sigma_px(self.settings) ** 2)
         except np.linalg.LinAlgError:
             return float("inf")
         return float(np.sqrt(np.trace(covariance[3:, 3:])) / np.median(depth))
@@ -241,12 +239,21 @@ class Relocalizer:
     """Finds frames in one map, whose keyframes are indexed once."""
 
     def __init__(
-        self, map_: Map, camera: Camera, settings: RecoverySettings, seed: int, scale: float = 1.0
+        self,
+        map_: Map,
+        camera: Camera,
+        settings: RecoverySettings,
+        seed: int,
+        scale: float = 1.0,
+        turn_deg_s: float = StartSettings.turn_deg_s,
     ) -> None:
-        """`scale` of the descriptors' distances, over RootSIFT's."""
+        """`scale` of the descriptors' distances, over RootSIFT's; `turn_deg_s` as a camera may
+        turn, one deviation."""
         self._map, self._scale = map_, scale
         self._same_m = _SAME * map_.depth_m
         self._camera, self._settings, self._seed = camera, settings, seed
+        shear_px = camera.fx_px * np.deg2rad(turn_deg_s) * camera.readout_s
+        self._most_open = _SAME * _sigma_px(settings) / shear_px if shear_px else np.inf
         self._index: PlaceIndex | None = None
         if len(map_.keyframes):
             self._index = PlaceIndex(map_.landmarks, map_.keyframes, seed, map_.modes)
@@ -293,8 +300,7 @@ class Relocalizer:
         if not sure:
             return f"{found[0].doubt} in the most alike places"
         best = _undisputed(sure, self._same_m)
-        held = not self._camera.readout_s  # all rows at once: what is open is known
-        if isinstance(best, str) or held or best.open_by <= _MAX_SIGMA:
+        if isinstance(best, str) or best.open_by <= self._most_open:
             return best
         return f"the inliers leave the position open by {best.open_by:.1%} of their depth"
 
@@ -303,7 +309,12 @@ class Relocalizer:
         if isinstance(proposed, str):
             return proposed
         wTc, inliers = proposed
-        return search.confirm(wTc, index.seen_by(index.seeing(inliers, _NEIGHBOURS)))
+        return search.confirm(wTc, inliers, index.seen_by(index.seeing(inliers, _NEIGHBOURS)))
+
+
+def _sigma_px(settings: RecoverySettings) -> float:
+    """An inlier's standard deviation: half of what it may miss by."""
+    return settings.max_reprojection_px / 2
 
 
 def _undisputed(found: list[Relocalization], same_m: float) -> Relocalization | str:
@@ -322,5 +333,5 @@ def _only_place(search: _Search) -> list[Relocalization] | str:
     proposed = search.propose(everything)
     if isinstance(proposed, str):
         return proposed
-    found = search.confirm(proposed[0], everything)
+    found = search.confirm(*proposed, everything)
     return found if isinstance(found, str) else [found]

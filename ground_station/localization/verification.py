@@ -11,7 +11,7 @@ from ground_station.arrays import F32, F64, Indices
 from ground_station.features.extractor import Features
 from ground_station.geometry.camera import Camera
 from ground_station.localization.settings import WIDTH_PX, ProjectionSettings
-from ground_station.localization.visibility import project
+from ground_station.localization.visibility import project, widened
 from ground_station.map.modes import Modes, described
 from ground_station.map.store import Landmarks
 
@@ -77,9 +77,14 @@ class Witness:
         self._farthest = min(_MAX_DISTANCE * scale, max(_MAX_DISTANCE, APART))
         self._tree = cKDTree(features.keypoints_px)
 
-    def support(self, wTc: F64, landmarks: Landmarks, index: Indices) -> Support:
-        """The support of a pose (4, 4) by the landmarks `index` (M,) that it should see."""
-        index, pixel = self._seen(wTc, landmarks, index)
+    def support(
+        self, wTc: F64, landmarks: Landmarks, index: Indices, seen: Indices | None = None
+    ) -> Support:
+        """The support of a pose (4, 4) by the landmarks `index` (M,) that it should see.
+
+        `seen` (N,) are landmarks that were found already, in whatever cones.
+        """
+        index, pixel = self._seen(wTc, landmarks, index, seen)
         if not len(index):
             return Support(np.empty(0, np.intp), np.empty(0, np.intp), 0, 0.0, 0.0)
         descriptors, mode = described(landmarks.descriptor, self._modes, index)
@@ -100,16 +105,21 @@ class Witness:
         share, by_chance = float(found.mean()), float(chance.mean())
         return Support(feature[rows], index[rows], len(index), share, by_chance, evenness)
 
-    def count(self, wTc: F64, landmarks: Landmarks, index: Indices) -> int:
+    def count(
+        self, wTc: F64, landmarks: Landmarks, index: Indices, seen: Indices | None = None
+    ) -> int:
         """How many of the landmarks `index` (M,) are found, by chance or not."""
-        index, pixel = self._seen(wTc, landmarks, index)
+        index, pixel = self._seen(wTc, landmarks, index, seen)
         descriptors, mode = described(landmarks.descriptor, self._modes, index)
         return int((self._near(pixel, descriptors, mode)[1] < self._farthest).sum())
 
-    def _seen(self, wTc: F64, landmarks: Landmarks, index: Indices) -> tuple[Indices, F64]:
+    def _seen(
+        self, wTc: F64, landmarks: Landmarks, index: Indices, seen: Indices | None
+    ) -> tuple[Indices, F64]:
         """Those of the landmarks `index` (M,) that a pose (4, 4) should see, and their pixels."""
-        seen = project(landmarks, wTc, self.camera, _CONES, index)
-        return seen.landmark, self.camera.distort(seen.normalized)
+        cones = widened(_CONES, landmarks, seen, wTc[:3, 3])
+        projected = project(landmarks, wTc, self.camera, cones, index)
+        return projected.landmark, self.camera.distort(projected.normalized)
 
     def _near(self, pixel_px: F64, descriptors: F32, mode: Indices | None) -> tuple[Indices, F64]:
         """For each pixel (N, 2) the nearby feature of nearest descriptor: index, distance (inf).

@@ -6,7 +6,7 @@ together (Alcantarilla et al., ICRA 2010), which also knows what hides behind a 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -61,19 +61,46 @@ def project(
 def _in_cone(
     landmarks: Landmarks, index: Indices, position_m: F64, settings: ProjectionSettings
 ) -> Bools:
-    """Whether landmarks `index` (N,) are looked at from within their widened cones; (N,).
+    """Whether landmarks `index` (N,) are looked at from within their widened cones; (N,)."""
+    beyond, ratio = _off_cone(landmarks, index, position_m)
+    margin = np.deg2rad(settings.cone_margin_deg)
+    return np.asarray((beyond <= margin) & (ratio <= settings.max_distance_ratio))
 
-    `position_m` (3,) is the camera's, in the world. The distances that keyframes had count, too.
-    """
+
+def _off_cone(landmarks: Landmarks, index: Indices, position_m: F64) -> tuple[F64, F64]:
+    """How far outside of their cones landmarks `index` (N,) are looked at, radians, (N,), and how
+    many times nearer or farther than keyframes were, (N,), from a place (3,) in the world."""
     rays = position_m - landmarks.position_m[index]
     distance = np.maximum(np.linalg.norm(rays, axis=1), 1e-9)
     cosine = np.einsum("ij,ij->i", rays, landmarks.view_direction[index]) / distance
     half = np.arccos(np.clip(landmarks.view_cos[index], -1.0, 1.0))
-    limit = np.cos(np.minimum(half + np.deg2rad(settings.cone_margin_deg), np.pi))
-    ratio = settings.max_distance_ratio
+    beyond = np.arccos(np.clip(cosine, -1.0, 1.0)) - half
     nearest, farthest = landmarks.distance_m[index].T
-    return np.asarray(
-        (cosine >= limit) & (distance * ratio >= nearest) & (distance <= farthest * ratio)
+    return np.asarray(beyond), np.asarray(np.maximum(nearest / distance, distance / farthest))
+
+
+_HELD, _BEYOND = 0.75, 1.1
+"""Cones widened for landmarks that are seen hold three in four of these, which wrong ones among
+them hardly move, and a tenth more, as the camera moves on."""
+
+
+def widened(
+    settings: ProjectionSettings, landmarks: Landmarks, seen: Indices | None, position_m: F64
+) -> ProjectionSettings:
+    """The same, in whose cones landmarks `seen` (N,) are looked at from a place (3,).
+
+    How far from its keyframes a landmark is known again differs with what is seen: a poster is
+    from 70 degrees aside. Where some are, others of their kind are to be expected, too.
+    """
+    if not settings.viewing_cone or seen is None or not len(seen):
+        return settings
+    beyond, ratio = (
+        _BEYOND * float(np.quantile(each, _HELD)) for each in _off_cone(landmarks, seen, position_m)
+    )
+    return replace(
+        settings,
+        cone_margin_deg=max(settings.cone_margin_deg, float(np.rad2deg(beyond))),
+        max_distance_ratio=max(settings.max_distance_ratio, ratio),
     )
 
 

@@ -187,12 +187,14 @@ def test_what_is_left_open_is_refused_only_where_a_shutter_may_shear_it(building
     found = find(building.map, features)
     assert isinstance(found, Relocalization)
     far = replace(found, open_by=0.02)
-    still = replace(THESIS_CAMERA, readout_s=0.0)
-    rolling, whole = (
-        Relocalizer(building.map, camera, SETTINGS, 0) for camera in (THESIS_CAMERA, still)
-    )
-    assert "open by 2.0%" in str(rolling.alone([far]))
-    assert whole.alone([far]) is far
+
+    def believed(readout_s: float, turn_deg_s: float = 40.0) -> Relocalization | str:
+        camera = replace(THESIS_CAMERA, readout_s=readout_s)
+        relocalizer = Relocalizer(building.map, camera, SETTINGS, 0, turn_deg_s=turn_deg_s)
+        return relocalizer.alone([far])
+
+    assert "open by 2.0%" in str(believed(0.02)) and believed(0.005) is far
+    assert believed(0.02, turn_deg_s=10.0) is far and believed(0.0) is far
 
 
 def test_what_differs_between_two_alike_places_decides(building):

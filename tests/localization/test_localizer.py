@@ -229,6 +229,19 @@ def test_a_turn_that_nothing_foretold_is_no_new_beginning(room, extractor):
         assert found.state is State.TRACKING and found.relocalized == (k == 0)
 
 
+def test_what_is_looked_at_from_far_outside_of_its_cones_is_found_and_followed(room, extractor):
+    landmarks = room.map.landmarks
+    aside = poses.exp([0.0, 0.0, np.deg2rad(75.0), 0.0, 0.0, 0.0])[:3, :3]
+    landmarks.view_direction[:] = landmarks.view_direction @ aside.T
+    landmarks.view_cos[:] = np.cos(np.deg2rad(10.0))
+    landmarks.distance_m[:] *= 3.5
+    flight = Flight(room, extractor)
+    found = [flight.frame(k) for k in range(40)]
+    assert found[0].relocalized and not any(each.relocalized for each in found[1:])
+    assert all(each.state is State.TRACKING for each in found)
+    assert max(flight.off_m(each, k) for k, each in enumerate(found)) < 0.03
+
+
 def test_a_find_that_the_camera_cannot_have_reached_waits_for_confirmation(room, extractor):
     flight = Flight(room, extractor).started()
     for k in range(3):
