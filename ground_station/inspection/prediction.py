@@ -121,7 +121,7 @@ _LEAST_CHANCE = 0.02
 """Landmarks less likely than this are not projected."""
 _WEAK = 1e-6
 """Information that keeps a pose without landmarks invertible: 1,000 of its units."""
-SIGMA_PX, NEEDED, MOST = 2.0, 20, 400
+SIGMA_PX, NEEDED, MOST = 2.0, 20, 1500
 """As the localizer's preset `default` has them, to which a test holds them: an observation's
 deviation, landmarks below which there is no keyframe to follow, observations solved at once."""
 
