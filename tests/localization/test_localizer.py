@@ -242,6 +242,22 @@ def test_what_is_looked_at_from_far_outside_of_its_cones_is_found_and_followed(r
     assert max(flight.off_m(each, k) for k, each in enumerate(found)) < 0.03
 
 
+def test_a_first_pose_from_elsewhere_forgets_what_was_seen(room, extractor, monkeypatch):
+    flight, recent = Flight(room, extractor).started(), []
+    find = flight.localizer._acquirer.find
+
+    def asked(seen, *others):
+        recent.append(seen.taken.recent)
+        return find(seen, *others)
+
+    monkeypatch.setattr(flight.localizer._acquirer, "find", asked)
+    flight.frame(0)
+    flight.frame(1)
+    flight.localizer.set_initial_pose(flight.path[150], int(flight.times[150]))
+    flight.frame(150)
+    assert recent[0] is None and len(recent[1]) > 12 and recent[2] is None
+
+
 def test_a_find_that_the_camera_cannot_have_reached_waits_for_confirmation(room, extractor):
     flight = Flight(room, extractor).started()
     for k in range(3):
