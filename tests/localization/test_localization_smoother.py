@@ -363,8 +363,23 @@ def test_the_densities_follow_slow_and_fast_flights_so_that_predictions_know_the
     # 12 degrees of freedom. A slow flight may be doubted too much, not too little.
     assert 3 < np.mean(quiet) < 14
     assert 6 < np.mean(shaken) < 18
-    assert fast.density.rotation > 100 * slow.density.rotation
-    assert fast.density.translation > 30 * slow.density.translation
+    assert fast.density(1 / 30).rotation > 100 * slow.density(1 / 30).rotation
+    assert fast.density(1 / 30).translation > 30 * slow.density(1 / 30).translation
     # Without them the fast flight is far outside of what a quiet one expects.
     stiff, _ = flown("fast", 42, MotionSettings(density_limit=1.0))
     assert np.mean(stiff) > 100
+
+
+def test_at_five_frames_a_second_a_prediction_does_not_hold_back_what_is_seen_alike_each_time():
+    """Errors of a map are alike from frame to frame: nothing of them tells how a camera turns."""
+    simulation = SimulationSettings(out=Path("none"), plan="loop", seed=41, duration_s=30.0)
+    times_s, sigma = np.arange(1.0, 28.0, 0.2), np.r_[np.full(3, 0.002), np.full(3, 0.012)]
+    wTcs = prepare_flight(simulation).motion.wTc(times_s)
+    times_ns = np.rint(times_s * 1e9).astype(np.int64).tolist()
+    smoother, late_m = FixedLagSmoother(MotionSettings()), []
+    wide = np.diag(np.repeat([0.05, 0.1, 0.7, 1.5], 3) ** 2)
+    smoother.begin(Kinematics(times_ns[0], wTcs[0], np.zeros(6), wide))
+    for time_ns, wTc in zip(times_ns[1:], wTcs[1:], strict=True):
+        state = smoother.update(solve(smoother.predict(time_ns), wTc, sigma))
+        late_m.append(np.linalg.norm(state.wTc[:3, 3] - wTc[:3, 3]))
+    assert np.sqrt(np.mean(np.square(late_m[10:]))) < 0.004  # 7 mm with one density for all steps
