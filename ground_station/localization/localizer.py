@@ -26,6 +26,7 @@ from ground_station.localization.judge import (
     Judge,
     covariance_in_map,
     covariance_in_world,
+    crowded,
     evidence_of,
 )
 from ground_station.localization.kinematics import Kinematics, Solution
@@ -74,7 +75,7 @@ class Localizer:
         self.rest_s = 0.0
         """Raised by who must skip frames for lack of processor: a younger keyframe is then renewed
         only where it runs out, or where a pose waits for one to be confirmed, and where this is
-        more than keyframes rest anyway, they carry half of the points."""
+        more than keyframes rest anyway, they carry a quarter of the points."""
         camera, is_maps = against_map(map_.info, camera)
         self._of_focal = considered(map_, is_maps, settings.covariance.focal)
         self.map, self.camera, self.extractor, self.settings = map_, camera, extractor, settings
@@ -296,7 +297,7 @@ class Localizer:
         relocalized = self._land(attempt)
         tracking, keyframe = self.settings.tracking, self._keyframe
         if keyframe is not None and self.rest_s > tracking.keyframe_interval_s:
-            self._keyframe = keyframe.first(tracking.max_points // 2)
+            self._keyframe = keyframe.first(tracking.max_points // 4)
         attempt.predicted = self._estimator.predict(attempt.time_ns)
         reason = f"searching; last refused: {self._refused}" if self._refused else "searching"
         if self._keyframe is not None and attempt.predicted is not None:
@@ -423,7 +424,8 @@ class Localizer:
         assert state is not None
         self._seen = attempt.observations.landmark[solution.inlier]
         settings = self.settings.covariance
-        in_map = covariance_in_map(state.covariance, solution, settings, self._of_focal)
+        crowding = crowded(attempt.observations.pixel_px[solution.inlier], self.camera)
+        in_map = covariance_in_map(state.covariance, solution, settings, self._of_focal, crowding)
         support_ns = followed.support_ns if followed else attempt.time_ns
         evidence = evidence_of(
             attempt, solution, in_map, self.camera, support_ns, self._denied if followed else 0

@@ -38,6 +38,11 @@ def near_px(camera: Camera) -> float:
     return _RADIUS_PX * max(camera.width_px / WIDTH_PX, _LEAST)
 
 
+def cells(pixel_px: F32 | F64, width_px: int) -> F64:
+    """In which cells (N, 2) of a picture so wide pixels (N, 2) lie."""
+    return np.asarray(pixel_px // (width_px / _CELLS))
+
+
 @dataclass(frozen=True)
 class Support:
     """What speaks for a pose.
@@ -101,7 +106,7 @@ class Witness:
         rows = np.flatnonzero(found)
         rows = rows[np.argsort(distance[rows], kind="stable")]
         rows = rows[np.unique(feature[rows], return_index=True)[1]]
-        evenness = _evenness(pixel // (self._width_px / _CELLS), found - chance)
+        evenness = _evenness(cells(pixel, self._width_px), found - chance)
         share, by_chance = float(found.mean()), float(chance.mean())
         return Support(feature[rows], index[rows], len(index), share, by_chance, evenness)
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from synthetic import FakeExtractor, apart, preset_with, unit
+from synthetic import CAMERA, FakeExtractor, apart, preset_with, unit
 
 from ground_station.experiments.disturbances.scale import Scale
 from ground_station.geometry import poses
@@ -17,7 +17,7 @@ from ground_station.localization.attempt import Conditions, Stopwatch
 from ground_station.localization.estimate import Counts, no_observations
 from ground_station.localization.estimator import make_estimator
 from ground_station.localization.following import Followed, Since, better, catch_up
-from ground_station.localization.judge import covariance_in_map, covariance_in_world
+from ground_station.localization.judge import covariance_in_map, covariance_in_world, crowded
 from ground_station.localization.kinematics import no_solution
 from ground_station.localization.localizer import Localizer
 from ground_station.localization.matching import Matcher, describe
@@ -374,6 +374,16 @@ def test_what_frames_have_in_common_is_no_less_for_many_than_for_one():
     assert np.isinf(shared).all()
     same = covariance_in_map(covariance, nothing, CovarianceSettings(), lenses)
     assert np.array_equal(same, plain)
+    thrice = covariance_in_map(covariance, told, CovarianceSettings(shared=0.25), none, 3.0)
+    assert np.allclose(thrice, 0.75 * plain + 0.25 * 3 * 3 * np.diag(1 / np.arange(1.0, 7.0)))
+
+
+def test_landmarks_that_lie_together_count_for_one_part_of_the_picture():
+    one = np.stack(np.meshgrid(np.arange(5.0, 640, 40), np.arange(5.0, 480, 40)), axis=2)
+    one = one.reshape(-1, 2).astype(np.float32)
+    assert crowded(one, CAMERA) == 1.0
+    assert crowded(np.repeat(one, 4, axis=0) + np.float32(9), CAMERA) == 4.0
+    assert crowded(2 * one, dataclasses.replace(CAMERA, width_px=2 * CAMERA.width_px)) == 1.0
 
 
 def test_the_maps_own_errors_are_added_by_their_share():
