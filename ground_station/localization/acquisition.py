@@ -281,16 +281,13 @@ class Acquirer:
     def keyframe(self, time_ns: int, image: U8, wTc: F64, found: Located) -> Keyframe:
         """The inliers of a frame at `wTc` (4, 4), thinned evenly, to be followed.
 
-        Those of surely the same descriptor; others only where these are few, and less trusted: the
-        error of a match grows with its descriptors' distance (measured; landmarks seen in another
-        light, or their neighbours).
+        Those of another descriptor are less trusted: the error of a match grows with its
+        descriptors' distance (measured; landmarks seen in another light, or their neighbours).
         """
         settings, seen = self._settings.tracking, found.observations
         inlier = np.flatnonzero(seen.inlier)
         distance = found.matches.distance[inlier]
         inlier = inlier[np.argsort(distance, kind="stable")]
-        sure = int((distance <= settings.sure_distance).sum())
-        inlier = inlier[: max(sure, settings.sure_points)]
         inlier = inlier[spread_out(seen.pixel_px[inlier], settings.max_points)]
         pixel, landmark = seen.pixel_px[inlier], seen.landmark[inlier]
         points = np.asarray(self._landmarks.position_m[landmark], np.float64)

@@ -101,8 +101,6 @@ class TrackingSettings:
     max_difference: float = config.key(0.5, low=0, high=8)
     sigma_px: float = config.key(3.0, unit="px", low=0.1, high=50)
     min_inliers: int = config.key(10, low=6, high=1000)
-    sure_distance: float = config.key(0.5, low=0, high=2)
-    sure_points: int = config.key(100, low=0, high=2000)
     doubt_distance: float = config.key(0.3, low=0.01, high=2)
     min_significance: float = config.key(7.0, low=0, high=1000)
     min_found_share: float = config.key(0.1, low=0, high=1)
