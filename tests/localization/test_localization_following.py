@@ -295,6 +295,23 @@ def test_catching_up_gives_up_where_the_points_are_not(room, acquirer):
     assert not catch_up(landed, recent, acquirer.matcher, fresh)
 
 
+def test_all_inliers_are_followed_and_those_of_far_descriptors_less_trusted(room, acquirer):
+    _, path = room.path(1)
+    estimator = estimator_at(room, path[0])
+    found = acquirer.locate(seen_from(room, path[0]), estimator.predict(0), estimator, Stopwatch())
+    inlier = found.solution.inlier
+    distance = np.where(np.arange(len(inlier)) % 2, 0.2, 0.6).astype(np.float32)
+    found = dataclasses.replace(
+        found, matches=dataclasses.replace(found.matches, distance=distance)
+    )
+    keyframe = acquirer.keyframe(0, np.zeros((480, 640), np.uint8), path[0], found)
+    assert len(keyframe) == min(int(inlier.sum()), SETTINGS.tracking.max_points)
+    far = set(found.matches.landmark[inlier & (distance > 0.5)].tolist())
+    sigma_px = {True: 4 * SETTINGS.tracking.sigma_px, False: SETTINGS.tracking.sigma_px}
+    expected = [sigma_px[landmark in far] for landmark in keyframe.landmark.tolist()]
+    np.testing.assert_allclose(keyframe.sigma_px, expected, rtol=1e-6)
+
+
 class Turning(FakeExtractor):
     """A camera that turns on the spot; only its first view is ever described, and not at once."""
 

@@ -14,6 +14,7 @@ from ground_station.localization.extraction import extractor_for
 from ground_station.localization.settings import load_preset
 from ground_station.map import store
 from ground_station.map.floorplan import load_floorplan
+from ground_station.map.uncertainty import accuracy
 from ground_station.mapping.registration.observations import read_pairs
 from ground_station.mapping.settings import load_settings
 from ground_station.recording.flight import camera_of, trajectory_of
@@ -58,6 +59,9 @@ def test_the_map_is_registered_to_the_building() -> None:
     assert len(map_.keyframes) == len(truth)
     off = np.linalg.norm(map_.keyframes.wTc[:, :3, 3] - truth.position_m[at], axis=1)
     assert np.sqrt(np.mean(off**2)) < 0.02 and off.max() < 0.10
+    known = accuracy(map_.info).registration
+    assert known is not None  # or poses in it would pass for surer than they are
+    assert np.median(off / known.sigma_m(truth.position_m[at])) < 2
     turn = map_.keyframes.wTc[:, :3, :3] @ np.swapaxes(truth.wTc[at][:, :3, :3], 1, 2)
     assert np.degrees(rotation_angle(turn)).max() < 0.5
 
