@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ground_station.arrays import F64
-from ground_station.experiments.declaration import MapSpec
+from ground_station.experiments.declaration import FlightDeclaration, MapSpec
 from ground_station.experiments.flights import points_of
 from ground_station.experiments.material import flown
 from ground_station.files import write_json
@@ -56,17 +56,20 @@ def build(
     if not (recording and spec.flight.clicked):
         return register_map(folder, trajectory=material.truth, source="truth")[0]
     true = find_similarity(store.load(folder), trajectory=material.truth).fit
-    clicks = clicked(read_pairs(points_of(recording)), spec.flight.clicked, spec.seed)
+    clicks = clicked(read_pairs(points_of(recording)), spec.flight, spec.seed)
     registered, found = register_map(folder, observations=clicks, source="clicks")
     write_json(folder / _DISPLACEMENT, {"true": _plain(true), "found": _plain(found.fit)})
     return registered
 
 
-def clicked(known: PointObservations, count: int, seed: int) -> PointObservations:
-    """So many of the points, far from each other, as a person clicks and measures them."""
-    rng = np.random.default_rng([seed, count])
+def clicked(known: PointObservations, walk: FlightDeclaration, seed: int) -> PointObservations:
+    """As many of the points as a walk asks for, far from each other, clicked and measured.
+
+    A person errs otherwise in every building: with one draw for all, theirs would be one error.
+    """
+    rng = np.random.default_rng([seed, *walk.scene.encode()])
     places = known.world_m
-    chosen = spread_out(places, count)
+    chosen = spread_out(places, walk.clicked)
     kept = np.isin(known.point, chosen)
     number = np.full(len(places), -1, np.int64)
     number[chosen] = np.arange(len(chosen))

@@ -74,7 +74,8 @@ def known(count: int = 12) -> PointObservations:
 
 def test_a_person_clicks_a_few_points_far_apart_a_pixel_and_a_centimetre_off() -> None:
     given = known()
-    found = maps.clicked(given, 6, 101)
+    walk = FlightDeclaration(scene="atrium", clicked=6)
+    found = maps.clicked(given, walk, 101)
     assert len(found.points) == 6 and len(found.point) == len(found.image) == 18
     where = {name: k for k, name in enumerate(given.points)}
     true = given.world_m[[where[name] for name in found.points]]
@@ -89,9 +90,11 @@ def test_a_person_clicks_a_few_points_far_apart_a_pixel_and_a_centimetre_off() -
             i for i, m in zip(given.image, theirs, strict=True) if m
         ]
         assert 0.01 < np.abs(found.pixel_px[mine] - given.pixel_px[theirs]).mean() < 3
-    again = maps.clicked(given, 6, 101)
+    again = maps.clicked(given, walk, 101)
     assert np.array_equal(again.world_m, found.world_m)
-    assert len(maps.clicked(given, 18, 1).points) == 12
+    assert len(maps.clicked(given, replace(walk, clicked=18), 1).points) == 12
+    elsewhere = maps.clicked(given, replace(walk, scene="office"), 101)
+    assert np.abs(elsewhere.world_m - found.world_m).min() > 0  # another building, other errors
 
 
 def test_the_registrations_share_is_what_it_alone_displaces(tmp_path: Path, rooms: Map) -> None:
