@@ -6,13 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import fdtri
+from scipy.special import chdtri, fdtri
 
 from ground_station.arrays import F64
 from ground_station.errors import MapError
 from ground_station.map.store import MapInfo
 
-_PROBABILITY = 0.9
+_PROBABILITY, _ELLIPSOID = 0.9, 0.95
+_FREEDOM = "degrees_of_freedom"
+"""Of `map.toml`; where an older program did not write it, it counts as many."""
 _REGION = (0.01, 0.99)
 """Quantiles of the landmarks' coordinates that bound the mapped region: single ones lie outside."""
 
@@ -85,7 +87,7 @@ def describe(found: Uncertainty, positions: F64) -> dict[str, Any]:
     """What `map.toml` says of a registration of landmarks (M, 3) in the world, metres."""
     report: dict[str, Any] = {
         "scale_sigma_percent": 100 * found.scale_sigma,
-        "degrees_of_freedom": float(found.freedom),
+        _FREEDOM: float(found.freedom),
     }
     if len(positions):
         middle, corners = region(positions)
@@ -150,10 +152,18 @@ def accuracy(info: MapInfo) -> Accuracy:
         least = np.linalg.eigvalsh(covariance)[0]
         if not np.allclose(covariance, covariance.T) or least < -1e-9 * np.trace(covariance):
             raise MapError("map.toml, registration: 'covariance' is not a covariance")
-        known = Uncertainty(covariance, centre, 1.0)
+        freedom = max(1.0, float(_numbers({_FREEDOM: _MOST / 2} | table, _FREEDOM, ())))
+        known = Uncertainty(covariance * _of_few(freedom), centre, freedom)
     return Accuracy(
         _deviation(table, "sigma_deg", np.pi / 180), _deviation(table, deviation_m), known
     )
+
+
+def _of_few(freedom: float) -> float:
+    """By what a covariance whose scale was estimated with so much redundancy is to be multiplied,
+    so that the ellipsoid of position that is drawn from it holds 95 %: chi-square's quantile
+    becomes Fisher's F's (Hotelling, "The generalization of Student's ratio", 1931)."""
+    return float(3 * fdtri(3, freedom, _ELLIPSOID) / chdtri(3, 1 - _ELLIPSOID))
 
 
 def _deviation(table: dict[str, Any], key: str, unit: float = 1.0) -> float:

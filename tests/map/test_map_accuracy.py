@@ -35,6 +35,21 @@ def test_a_pose_inherits_what_a_registration_is_off():
     assert np.abs(off).max() < 0.05
 
 
+def test_of_few_points_the_ellipsoid_holds_what_it_says():
+    rng = np.random.default_rng(7)
+    for freedom in (5, 11, 2000):  # known from so many residuals of 1 cm
+        square = rng.chisquare(freedom, 20000) / freedom
+        off = rng.normal(size=(20000, 3))
+        table = {
+            "covariance": np.diag([0, 0, 0, 1, 1, 1, 0]).tolist(),
+            "covariance_about_m": POSE[:3, 3].tolist(),
+            "degrees_of_freedom": freedom,
+        }
+        known = accuracy(info(**table)).at(POSE)[3:, 3:]
+        inside = np.einsum("ni,ij,nj->n", off, np.linalg.inv(known), off) / square < 7.815
+        assert inside.mean() == pytest.approx(0.95, abs=0.01)
+
+
 def test_what_keyframes_scatter_is_added_in_every_axis():
     known = Uncertainty(np.diag(SIGMA**2), ABOUT, 9)
     more = Accuracy(0.002, 0.03, known).at(POSE) - Accuracy(registration=known).at(POSE)
@@ -68,6 +83,14 @@ def test_a_maps_accuracy_is_what_its_registration_says():
         ({"covariance": [[1.0]]}, "covariance"),
         ({"covariance": np.eye(7).tolist()}, "covariance_about_m"),
         ({"covariance": (-np.eye(7)).tolist(), "covariance_about_m": [0, 0, 0]}, "covariance"),
+        (
+            {
+                "covariance": np.eye(7).tolist(),
+                "covariance_about_m": [0, 0, 0],
+                "degrees_of_freedom": "eleven",
+            },
+            "degrees_of_freedom",
+        ),
         (
             {"covariance": np.triu(np.ones((7, 7))).tolist(), "covariance_about_m": [0, 0, 0]},
             "covariance",
